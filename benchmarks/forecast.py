@@ -37,7 +37,7 @@ from holosplat.motion.cell_model import ChannelFrame
 from holosplat.motion.dynamics import DynamicsForecast, carry
 from holosplat.motion.elastic import Rest
 from holosplat.motion.forecast import Forecast, Halves, PathForecast, extrapolate
-from holosplat.motion.half_sets import half_sets
+from holosplat.motion.split_half_errors import half_sets
 from holosplat.motion.track import TrackOptions, follow
 from holosplat.representations import MovingSurfaces
 from holosplat.representations.paths import TimeBasis

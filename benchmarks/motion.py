@@ -34,8 +34,8 @@ from holosplat.io.atomic import atomic_path
 from holosplat.mesh import TriangleMesh
 from holosplat.metrics import volume_scores
 from holosplat.motion.fit import MotionFit
-from holosplat.motion.halves import standard_errors
 from holosplat.motion.measures import area
+from holosplat.motion.split_half_errors import standard_errors
 from holosplat.motion.track import Followed, TrackOptions, follow
 from holosplat.representations import MovingSurfaces
 from holosplat.specimens.mesh_series import MeshSeries

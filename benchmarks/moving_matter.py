@@ -27,7 +27,7 @@ import holosplat as hs
 from holosplat.geometry import Grid
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import SmoothVolume
-from holosplat.motion.carried import CarriedOptions, merged
+from holosplat.motion.flow_reconstruction import CarriedOptions, merged
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.carried import CarriedScene, Fades
 from holosplat.workflows.moving import reconstruct_moving

@@ -31,8 +31,8 @@ from holosplat.io.vtk import write_mesh
 from holosplat.learning.network import Size
 from holosplat.mesh import TriangleMesh
 from holosplat.methods import METHODS, Gaussians, Pinn, SurfaceOptions
-from holosplat.motion.carried import CarriedOptions
 from holosplat.motion.fit import MotionFit
+from holosplat.motion.flow_reconstruction import CarriedOptions
 from holosplat.motion.track_options import TrackOptions
 from holosplat.planning import acts
 from holosplat.planning.needs import Needs, of_reconstruction

@@ -23,12 +23,11 @@ from scipy.ndimage import label
 from torch import Tensor
 
 import holosplat as hs
-from holosplat.bodies.touching import parted
+from holosplat.bodies.cut import parted
 from holosplat.inference import Compared
 from holosplat.learning.start import Guessed, LearnedStart, guess_matter, unexplained
 from holosplat.matter import Matter
-from holosplat.motion.guesses import NETWORK, missed_by_bodies
-from holosplat.motion.sightings import SightingOptions, occupancy
+from holosplat.motion.detections import NETWORK, SightingOptions, missed_by_bodies, occupancy
 from holosplat.representations import VoxelGrid
 from motion import MATERIAL, cells_in_flow, imaged
 

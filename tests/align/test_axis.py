@@ -10,8 +10,8 @@ import pytest
 
 from helpers.discs import PITCH, ball_lines
 from holosplat.align import Axis, AxisOptions, find_axis
-from holosplat.align.combine import Estimate, combined
-from holosplat.align.consistency import polynomials
+from holosplat.align.axis import LEAN, UPRIGHT
+from holosplat.align.consistency import Estimate, combined, polynomials
 from holosplat.checks import InputError
 from holosplat.geometry import Views, rotation_y
 from holosplat.scan import Exposures, Scan
@@ -132,6 +132,9 @@ def test_a_lean_that_is_not_sure_is_left():
     unsure = Axis(Estimate(1.0, 0.1), Estimate(0.01, 0.02), 10.0, 40)
     assert not unsure.leans
     assert "left as the scan says" in unsure.lines()[1]
+    assert [(one.name, one.choice, one.by) for one in unsure.decisions] == [(LEAN, UPRIGHT, "likelihood ratio")]
+    assert Axis(Estimate(1.0, 0.1), Estimate(0.01, 0.001), 10.0, 40).leans
+    assert Axis(Estimate(1.0, 0.1), None, 10.0, 40).decisions == ()
     scan = scan_of(HALF[::10])
     np.testing.assert_array_equal(unsure.applied(scan.exposures).views.rotations, scan.views.rotations)
 

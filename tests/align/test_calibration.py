@@ -15,8 +15,7 @@ from holosplat.align import CalibrationOptions, Uncertain, calibrate
 from holosplat.align.calibration import Calibrated, _Search
 from holosplat.align.changes import changes
 from holosplat.align.gauge import moved_onto
-from holosplat.align.phantom import Phantom, centre_of_mass
-from holosplat.align.phantom_fit import linearised, solved
+from holosplat.align.phantom import Phantom, centre_of_mass, linearised, solved
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.geometry import Views, rotation_tilted
 from holosplat.model import Alignment, measure

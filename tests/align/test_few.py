@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from helpers.misaligned_balls import MATERIAL, scan_of
 from holosplat.align import PoseOptions, Uncertain, align_views
 from holosplat.align.derivatives import projections
-from holosplat.align.evidence import weighed
 from holosplat.align.following import SHARP, SOFT, Following, of_poses
-from holosplat.align.untold import beside, motions
+from holosplat.align.marginal_likelihood import weighed
+from holosplat.align.null_space import beside, motions
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.geometry import Grid, Views
 from holosplat.matter import MaterialPrior
@@ -104,4 +104,5 @@ def test_few_noisy_frames_leave_a_good_plan():
     options = PoseOptions(Uncertain(shift=1.0, angle=0.5, roll=0.5), rounds=2, retrieval=15, first=10, steps=4, edges=0)
     found = align_views(noisy, MaterialPrior.known(MATERIAL), options)
     assert not found.changes.any()
-    assert [word.split(" is as")[0] for word in found.words if "may be noise" in word] == ["shift", "angle", "roll"]
+    (decision,) = (one for one in found.decisions if one.name == "errors of the plan")
+    assert decision.choice == "none"

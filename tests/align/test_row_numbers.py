@@ -8,11 +8,11 @@ import pytest
 from helpers.misaligned_balls import SHAPE
 from helpers.moving_balls import beams, thickness
 from helpers.row_images import gaussians, placed
-from holosplat.align.begin import ANGLE, Images, begun
 from holosplat.align.derivatives import in_pixels
+from holosplat.align.initial_geometry import ANGLE, Images, geometry_from_rows
+from holosplat.align.null_space import FACTOR as NUMBERS
+from holosplat.align.null_space import Told
 from holosplat.align.row_sums import COUNT, FACTOR, RETRIEVED, RowPrior, by_rows, plane_angles
-from holosplat.align.untold import FACTOR as NUMBERS
-from holosplat.align.untold import Told
 from holosplat.geometry import Views
 
 EXPECTED = np.array([2.0, 2.0, *np.deg2rad([1.0, 1.0, 1.0])])
@@ -75,7 +75,7 @@ def test_an_angle_that_is_held_neither_moves_nor_drifts():
     planned, when = in_pixels(beams(TWO).views), np.array([-1.0, 1.0])
     values = np.stack([thickness(beams(TWO).views, t).double().numpy() for t in when])
     images = Images(values, planned, np.zeros(2, dtype=bool), when)
-    found = begun(images, EXPECTED, 0.1 * EXPECTED, few=True)
+    found = geometry_from_rows(images, EXPECTED, 0.1 * EXPECTED, few=True)
     assert found is not None
     assert not found.numbers[:, ANGLE].any()
     assert not found.rates[:, ANGLE].any()

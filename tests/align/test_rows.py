@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 from helpers.misaligned_balls import SHAPE
 from helpers.moving_balls import beams, thickness
 from helpers.row_images import gaussians, placed
-from holosplat.align.begin import Images, begun
 from holosplat.align.derivatives import in_pixels
 from holosplat.align.gauge import moved_onto
+from holosplat.align.initial_geometry import NONE, REVERSED, Images, geometry_from_rows
+from holosplat.align.null_space import Told, motions
 from holosplat.align.row_sums import COUNT, RowPrior, Rows, by_rows, conditions, plane_angles
-from holosplat.align.untold import Told, motions
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.geometry import Views, rotation_tilted
 
@@ -141,10 +141,27 @@ def test_a_reversed_beam_is_noticed(side, axis):
     """And its numbers are those of its frames turned back."""
     values, planned, true = images(THREE, Misalignment(1.0, 0.6, 0.0, seed=2))
     values[:, 1] = np.flip(values[:, 1], axis)
-    found = begun(Images(values[1:3], planned, np.zeros(3, dtype=bool), WHEN[1:3]), EXPECTED, np.zeros(5), few=True)
+    found = geometry_from_rows(
+        Images(values[1:3], planned, np.zeros(3, dtype=bool), WHEN[1:3]), EXPECTED, np.zeros(5), few=True
+    )
     assert found is not None
     assert found.sides == ("", side, "")
+    assert found.decision.choice == f"beam 1 along {side}"
     assert apart(placed(found.numbers, planned), true)[0] < 0.05
+
+
+@pytest.mark.parametrize("angles", [THREE, TWO])
+def test_upright_beams_are_left_alone(angles):
+    """Of many balls in noise, and of soft matter that is nearly the same upside down."""
+    none = np.zeros(len(angles), dtype=bool)
+    values, planned, true = images(angles, Misalignment(1.0, 0.6, 0.0, seed=3))
+    noise = 0.3 * np.random.default_rng(3).normal(size=values[1:3].shape)
+    soft = np.repeat(gaussians(true)[None], 2, axis=0)
+    for one in (values[1:3] + noise, soft):
+        found = geometry_from_rows(Images(one, planned, none, WHEN[1:3]), EXPECTED, np.zeros(5), few=True)
+        assert found is not None
+        assert found.sides == ("",) * len(angles)
+        assert (found.decision.name, found.decision.choice, found.decision.by) == (REVERSED, NONE, "the same rows")
 
 
 @pytest.mark.parametrize(("share", "free"), [(0.6, False), (1.6, True)])
@@ -154,7 +171,7 @@ def test_angles_between_beams_are_free_where_they_are_told_firmly(share, free):
     held = by_rows(values, planned, RowPrior.of(EXPECTED * [1, 1, 1, 0, 1], 3), WHEN)
     least = Told.of(held.information, planned, EXPECTED).ratios[0]
     expected = EXPECTED * np.sqrt(share * 25.0 / least)
-    found = begun(Images(values, planned, np.zeros(3, dtype=bool), WHEN), expected, np.zeros(5), few=True)
+    found = geometry_from_rows(Images(values, planned, np.zeros(3, dtype=bool), WHEN), expected, np.zeros(5), few=True)
     assert found is not None
     assert found.numbers[:, 3].any() == free
 
@@ -166,7 +183,10 @@ def test_beams_beside_a_plane_have_no_rows_in_common():
     np.testing.assert_allclose(angles, np.deg2rad([0, 30]))
     values, planned, _ = images(TWO, Misalignment())
     tilted = replace(planned, rotations=rotation_tilted([0, 30], [0, 4]))
-    assert begun(Images(values, tilted, np.zeros(2, dtype=bool), WHEN), EXPECTED, np.zeros(5), few=True) is None
+    assert (
+        geometry_from_rows(Images(values, tilted, np.zeros(2, dtype=bool), WHEN), EXPECTED, np.zeros(5), few=True)
+        is None
+    )
 
 
 def test_matter_that_passes_the_edges_is_noticed():

@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 from helpers.misaligned_balls import MATERIAL, PIXEL
 from helpers.moving_balls import beams, series
 from holosplat.align import AlignedBeams, Drift, PoseOptions, Uncertain, align_views
+from holosplat.align.beams import DRIFT, LINEAR, STAY
 from holosplat.align.derivatives import NUMBERS
 from holosplat.align.gauge import moved_onto
-from holosplat.align.moments import Beams, Moment, chosen_moments
 from holosplat.align.newton import Normal
-from holosplat.align.series_search import SeriesSearch
+from holosplat.align.series_search import Beams, Moment, SeriesSearch, chosen_moments
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.checks import InputError
 from holosplat.matter import MaterialPrior
@@ -72,12 +72,12 @@ def test_a_drift_is_told_where_it_is_beyond_doubt(three):
     options = PoseOptions(retrieval=15, rounds=1, first=20, drift=Drift(shift=2.0))
     scan, true = series(planned, ERRORS, 4, drift=2.0)
     found = align_views(scan, PRIOR, options)
-    assert "the drift is beyond doubt" in found.words
+    assert [one.choice for one in found.decisions if one.name == DRIFT] == [LINEAR]
     assert any("drifts, first time to last" in line for line in found.lines())
     for k in (0, 9):
         assert apart(found.exposures[k : k + 3], true[k : k + 3])[0] < 0.1
     still = align_views(three[0], PRIOR, options)
-    assert any(word.startswith("no drift") for word in still.words)
+    assert [one.choice for one in still.decisions if one.name == DRIFT] == [STAY]
     assert isinstance(still, AlignedBeams)
     assert not still.drift.any()
 

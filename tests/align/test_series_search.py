@@ -10,10 +10,9 @@ from helpers.misaligned_balls import MATERIAL
 from helpers.moving_balls import beams, series
 from holosplat.align import Drift, PoseOptions, Uncertain
 from holosplat.align.derivatives import NUMBERS
-from holosplat.align.moments import Moment
 from holosplat.align.newton import Normal
 from holosplat.align.poses import DISTANCE, MAGNIFICATION, Level, PoseSearch
-from holosplat.align.series_search import SeriesSearch
+from holosplat.align.series_search import Moment, SeriesSearch
 from holosplat.beamline.misalignment import Misalignment
 
 WHENS, ORDERS = (-1.0, 0.5), ([2, 0, 1], [0, 1, 2])

@@ -8,21 +8,24 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from torch.nn.functional import interpolate
+from torch.nn.functional import interpolate, pad
 
 from helpers.discs import ball_lines
 from helpers.misaligned_balls import BALLS, MATERIAL, PIXEL, scan_of
 from holosplat.align import AlignedViews, PoseOptions, Uncertain, align_views
-from holosplat.align.coarse import mirrored, shifts_by_mass
-from holosplat.align.derivatives import NUMBERS, Predicted, projections
+from holosplat.align.derivatives import NUMBERS, Predicted, in_pixels, projections
 from holosplat.align.gauge import moved_onto
+from holosplat.align.initial_geometry import mirrored, shifts_by_mass
 from holosplat.align.newton import Normal, blurred, step
-from holosplat.align.views import Judged
+from holosplat.align.sharp import EDGES, SURFACES, VOXELS
+from holosplat.align.views import PLANNED, POSES, Judged
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
 from holosplat.matter import MaterialPrior
+from holosplat.model import Instrument
 from holosplat.scan import Exposures, Scan
+from holosplat.volume import LineIntegrals
 
 QUICK = PoseOptions(rounds=2, retrieval=15, first=20, edges=0, few_views=2)
 """Options of tests that do not ask how near the poses come; test_rehearsal.py has what few views need beside."""
@@ -55,6 +58,20 @@ def test_shifts_turns_and_roll_of_every_view_are_found(misaligned):
     assert after[2] < 0.08
 
 
+def test_surfaces_are_taken_where_matter_has_edges(misaligned):
+    """And not for soft lumps of the same material, whose frames voxels explain."""
+    assert [one.choice for one in misaligned[2].decisions if one.name == EDGES] == [SURFACES]
+    scan, true, _ = misaligned
+    instrument = Instrument(true, 1)
+    my, mx = instrument.margin
+    wide = pad(torch.from_numpy(PIXEL * gaussians(in_pixels(true.views))).float(), (mx, mx, my, my))[:, None]
+    frames = instrument.frames(LineIntegrals(wide, ((MATERIAL.delta, MATERIAL.beta),)))
+    few = Uncertain(shift=1.0, angle=0.0, roll=0.0)
+    options = PoseOptions(few, rounds=1, retrieval=8, first=10, steps=4, few_views=2, edges=12)
+    found = align_views(Scan(frames.numpy(), true, scan.is_test), MaterialPrior.known(MATERIAL), options)
+    assert [one.choice for one in found.decisions if one.name == EDGES] == [VOXELS]
+
+
 def test_edges_tell_the_distances_beside_their_mean(misaligned):
     """The first fringe is narrower than a pixel: the mean of the training views is as planned, and few are held out."""
     scan, true, found = misaligned
@@ -81,7 +98,7 @@ def test_what_is_left_falls_and_is_told(misaligned):
     assert "hardly told: distance" in [word.split(", in views")[0] for word in found.words]  # its mean is the plan's
     text = "\n".join(found.lines())
     assert "rms" in text
-    assert len(found.lines()) == 3 + len(found.words) + len(scan)
+    assert len(found.lines()) == 3 + len(found.words) + len(found.decisions) + len(scan)
     moved = moved_onto(found.exposures.views, scan.views)
     np.testing.assert_allclose(moved.shifts, found.exposures.views.shifts, atol=1e-3 * PIXEL)
     np.testing.assert_allclose(moved.rotations, found.exposures.views.rotations, atol=1e-6)
@@ -109,7 +126,7 @@ def test_a_good_plan_is_kept():
     """It loses nothing, for what differs by less than can be known is put back."""
     scan, _ = scan_of(Misalignment(), 8)
     found = align_views(scan, MaterialPrior.known(MATERIAL), replace(QUICK, rounds=3))
-    assert {word.split(" is as planned")[0] for word in found.words} & {"shift", "all"}
+    assert [one.choice for one in found.decisions if one.name == POSES] == [PLANNED]
     np.testing.assert_allclose(found.exposures.views.shifts, scan.views.shifts, atol=1e-9 * PIXEL)
 
 
@@ -151,7 +168,12 @@ def test_a_mirrored_beam_is_reported(misaligned):
 def test_few_training_frames_do_not_judge_what_was_found(monkeypatch, enough, kept):
     """They agree with any poses, so that what is left of them says nothing; of enough frames it does."""
     left = iter([1.0, 1.1])
-    worse = classmethod(lambda _, scan, *__: Judged(np.full(len(scan), next(left)), [""] * len(scan)))
+
+    def judged(_, scan, *__):
+        size = next(left)
+        return Judged(np.full(len(scan), size), [""] * len(scan), torch.full(scan.frames.shape, size))
+
+    worse = classmethod(judged)
     monkeypatch.setattr(Judged, "of", worse)
     scan, _ = scan_of(Misalignment(1.0, 0.0, 0.0, seed=2), 5, 6)
     options = replace(QUICK, uncertain=Uncertain(angle=0.0, roll=0.0), rounds=1, few_views=enough)

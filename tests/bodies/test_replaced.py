@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from helpers.motion_shadows import FLOW, OTHER, TURN, cell, pose, shadows
-from holosplat.bodies import replaced
-from holosplat.bodies.pool import Pool, annealed
+from holosplat.bodies import neighbourhood_search
+from holosplat.bodies.neighbourhood_search import NeighbourhoodSearch, Pool, best_choice
 from holosplat.bodies.poses import FREER, Explained
-from holosplat.bodies.replaced import Replaced
 from holosplat.bodies.templates import Search, Templates
 
 
@@ -22,7 +21,7 @@ def test_a_choice_is_the_best_of_all():
     products, gains = images @ images.T, images @ (images[[1, 4, 8]].sum(0) + 0.1 * draws.normal(size=23)) - 0.01
     choices = np.array(list(product((0, 1), repeat=11)))
     costs = 0.5 * np.einsum("ni,ij,nj->n", choices, products, choices) - choices @ gains
-    found = annealed(products, gains, np.random.default_rng(0))
+    found = best_choice(products, gains)
     np.testing.assert_array_equal(found, choices[costs.argmin()].astype(bool))
 
 
@@ -31,22 +30,22 @@ def test_the_best_of_several_tries_are_put_together():
     truth = [pose(TURN, (6.0, 0.0, -5.0)), pose(OTHER, (-6.0, 1.0, 5.0), 1.2)]
     every = Explained(cell(), shadows(truth))
     pool = Pool(every)
-    assert pool.chosen(np.random.default_rng(0)) == []
+    assert pool.chosen() == []
     pool.add([truth[0], pose(TURN, (-6.0, 0.0, -5.0))])
     pool.add([pose(OTHER, (6.0, 1.0, 5.0)), truth[1]])
-    assert {id(one) for one in pool.chosen(np.random.default_rng(0))} == {id(one) for one in truth}
+    assert {id(one) for one in pool.chosen()} == {id(one) for one in truth}
 
 
 def test_a_body_that_stands_for_two_is_replaced_by_them(monkeypatch):
     """It lies between two cells that cross in the first beam; from there no small step is better."""
-    monkeypatch.setattr(replaced, "PATIENCE", 1)
+    monkeypatch.setattr(neighbourhood_search, "PATIENCE", 1)
     truth = [pose(TURN, (1.0, 0.0, -7.0)), pose(OTHER, (-1.0, 1.0, 7.0), 1.1)]
     seen = shadows(truth)
     every = Explained(cell(), seen)
     search = Search(Templates.of(cell(), seen), seen, FLOW[None])
     begun = every.improved([pose(TURN, (0.0, 0.5, 0.0))], 15)
     heard: list[float] = []
-    found = Replaced(every, search, 1).better(begun, on_progress=heard.append)
+    found = NeighbourhoodSearch(every, search, 1).better(begun, on_progress=heard.append)
     assert len(found) == 2
     for one in truth:
         assert min(np.linalg.norm(other.centre - one.centre) for other in found) < 0.5
@@ -57,7 +56,7 @@ def test_a_body_that_stands_for_two_is_replaced_by_them(monkeypatch):
 def test_nothing_becomes_nothing():
     seen = shadows([])
     every = Explained(cell(), seen)
-    assert Replaced(every, Search(Templates.of(cell(), seen), seen, FLOW[None])).better([]) == []
+    assert NeighbourhoodSearch(every, Search(Templates.of(cell(), seen), seen, FLOW[None])).better([]) == []
 
 
 def test_doubts_are_where_something_is_missing():

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from helpers.motion_shadows import FLOW, OTHER, TURN, cell, pose, shadows
-from holosplat.bodies import replaced
+from holosplat.bodies import neighbourhood_search
+from holosplat.bodies.neighbourhood_search import pursued
 from holosplat.bodies.poses import Explained, Pose
 from holosplat.bodies.pursuit import exchanged
-from holosplat.bodies.replaced import pursued
 from holosplat.bodies.search import best_size
 from holosplat.bodies.templates import Search, Templates
 from holosplat.fit.running import Steps
@@ -46,7 +46,7 @@ def test_a_search_begins_with_what_is_known_where_that_explains_more(monkeypatch
     near = [replace(one, centre=one.centre + 0.8) for one in truth]
     astray = pose(TURN, (0.0, -18.0, 0.0))
     seen = shadows(truth)
-    monkeypatch.setattr(replaced, "PATIENCE", 1)
+    monkeypatch.setattr(neighbourhood_search, "PATIENCE", 1)
     assert not pursued(cell(), seen, FLOW[None], [astray])[1]
     monkeypatch.setattr(Search, "tops", lambda *given: [])
     found, of_begun = pursued(cell(), seen, FLOW[None], [*near, astray])

@@ -15,7 +15,7 @@ from holosplat.io.reading import Reading
 from holosplat.io.volumes import read_volume
 from holosplat.matter import DeltaBeta, KnownTwo
 from holosplat.methods import SmoothVolume
-from holosplat.motion.carried import CarriedOptions, Search
+from holosplat.motion.flow_reconstruction import CarriedOptions, Search
 from holosplat.optics.background import LightOptions
 from holosplat.representations import MovingGaussians, SpaceTimeField
 from holosplat.workflows.moving import reconstruct_moving

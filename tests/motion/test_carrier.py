@@ -13,9 +13,9 @@ from helpers.moving_ellipsoids import MATERIAL, PIXEL, scan, true_paths
 from holosplat.cli.bodies import MotionFlags
 from holosplat.fit.schedule import Schedule
 from holosplat.matter import Matter
-from holosplat.motion.carrier import FAMILIES, Carried, Carrier, Expected, middles_of
 from holosplat.motion.fit import MotionFit, motion_fit
-from holosplat.motion.remainder import only
+from holosplat.motion.residual_detection import only
+from holosplat.motion.velocity_prior import FAMILIES, Carried, Carrier, Expected, middles_of
 from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.specimens.red_cells import icosphere
 

@@ -17,7 +17,7 @@ from holosplat.geometry import Grid
 from holosplat.io.objects import read_object, write_object
 from holosplat.matter import MaterialPrior
 from holosplat.methods import SmoothVolume, Task
-from holosplat.motion.carried import CarriedOptions, Search, merged
+from holosplat.motion.flow_reconstruction import CarriedOptions, Search, merged
 from holosplat.representations import Fading, Flow, Lattice, TimeBasis
 from holosplat.representations.flow import fading_factor
 
@@ -120,12 +120,11 @@ def test_what_fades_is_reconstructed_better_where_it_may(way, bound, tmp_path):
 
 def test_what_fades_in_its_place_is_said_to_change():
     """A flow alone explains little of it; and what neither moves nor fades is said to do neither."""
-    _, fading = series(drifting((0.0, 0.0, 0.0), Fades(0.5)))
-    _, still = series(drifting((0.0, 0.0, 0.0)))
+    _, fading = series(drifting((0.0, 0.0, 0.0), Fades(0.5)), 3000.0)
+    _, still = series(drifting((0.0, 0.0, 0.0)), 3000.0)
     for scan, wanted in ((fading, True), (still, False)):
         made = search(scan, 1.0)
         assert made.moves(made.by_itself(merged(scan), "mean")) is wanted
-        assert "a steady flow and a change of δ take" in made.history[-1]
 
 
 def test_fadings_that_do_not_fit_are_refused():

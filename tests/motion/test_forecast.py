@@ -18,7 +18,7 @@ from holosplat.mesh import TriangleMesh
 from holosplat.metrics.volumes import normal_distance
 from holosplat.motion.fit import MotionFit
 from holosplat.motion.forecast import PathForecast, across, extrapolate, normals
-from holosplat.motion.half_sets import half_sets
+from holosplat.motion.split_half_errors import half_sets
 from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.specimens.red_cells import icosphere
 

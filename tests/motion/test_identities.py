@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from holosplat.checks import InputError
-from holosplat.motion.identities import LinkOptions, Seen, drift, identified, place_at
+from holosplat.motion.track_linking import LinkOptions, Seen, _middle, drift, identified, place_at
+from holosplat.representations import TimeBasis
 
 TIMES = 1e-5 * np.arange(10)
 RADIUS = 4.0
@@ -119,3 +120,21 @@ def test_nothing_seen_is_no_body():
 def test_options_out_of_range_are_refused(bad):
     with pytest.raises(InputError, match=next(iter(bad))):
         LinkOptions(**bad)
+
+
+@pytest.mark.parametrize(
+    ("count", "own", "bend", "degree"),
+    [(2, 5e5, 0.0, 0), (6, 0.0, 0.0, 0), (6, 5e5, 0.0, 1), (10, 5e5, 0.0, 1), (10, 5e5, 1e11, 2)],
+    ids=["two detections", "as the flow", "faster", "faster, many", "bent"],
+)
+def test_a_path_is_as_free_as_predicts_detections(count, own, bend, degree):
+    """Beside a flow of 2.5e5 along y: one or two detections, or such as the flow carries, do not tell a velocity."""
+    flow, basis = np.array([0.0, 2.5e5, 0.0]), TimeBasis(TIMES[0], TIMES[-1], 2)
+    noise = 0.05 * np.random.default_rng(3).normal(size=(count, 3))
+    along = flow[1] * TIMES[:count] + own * TIMES[:count] + bend * TIMES[:count] ** 2
+    seen = [Seen(t, np.array([0.0, along[t], 0.0]) + noise[t], VOLUME, False) for t in range(count)]
+    found = _middle(tuple(range(count)), 0, seen, TIMES, flow, basis)
+    slopes = basis.weights(TIMES, 1) @ found
+    wanted = flow[1] + (own + 2 * bend * TIMES if degree else 0.0) * np.ones(10)
+    np.testing.assert_allclose(slopes[:, 1], wanted, rtol=0.1 if degree else 1e-6)
+    assert (np.ptp(slopes[:, 1]) > 1.0) == (degree == 2)

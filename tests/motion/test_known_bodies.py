@@ -17,9 +17,8 @@ from holosplat.cli.track import BodyFlags
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.matter import Matter
 from holosplat.mesh import TriangleMesh
-from holosplat.motion.elastic import Elastic, RestShapeKept
+from holosplat.motion.elastic import Elastic, RestShapeKept, strain_energy
 from holosplat.motion.known import drift, poses_like
-from holosplat.motion.strain import strain_energy
 from holosplat.motion.track import TrackOptions, follow
 from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.specimens.mesh_series import MeshSeries

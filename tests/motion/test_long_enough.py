@@ -12,8 +12,7 @@ from holosplat.fit.smooth_volume import ContinuousPrior, Descent
 from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import Task
-from holosplat.motion.held_out import iterations_that_predict, kept_frames
-from holosplat.motion.timed_frames import Frames
+from holosplat.motion.timed_frames import Frames, iterations_that_predict, kept_frames
 from holosplat.representations import Flow, Lattice, TimeBasis
 from holosplat.scan import Exposures
 from holosplat.specimens.continuous import Bump, ContinuousScene, ellipsoid

@@ -11,8 +11,8 @@ from holosplat.bodies.moments import centroid, moments
 from holosplat.geometry import Views
 from holosplat.matter import Matter
 from holosplat.mesh import TriangleMesh
+from holosplat.motion.detections import Detection
 from holosplat.motion.measures import angular_velocity, columns, measure, measured, row, volume_velocity
-from holosplat.motion.sightings import Sighting
 from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.scan import Exposures
 from holosplat.specimens.red_cells import icosphere
@@ -103,7 +103,7 @@ def test_what_the_edge_cuts_is_known():
     assert is_cut(at(0, 7.0, 0), VIEWS)
     assert not is_cut(at(14.0, 0, 0), VIEWS)
     assert is_cut(at(14.0, 0, -30.0), VIEWS)
-    assert Sighting(at(0, 0, 0), False).reach == pytest.approx(3e-6, rel=0.03)
+    assert Detection(at(0, 0, 0), False).reach == pytest.approx(3e-6, rel=0.03)
 
 
 def test_what_one_beam_sees_is_in_the_field():

@@ -11,7 +11,7 @@ from helpers.kept import Kept
 from holosplat.checks import InputError
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import SmoothVolume, Task
-from holosplat.motion.carried import Carried, CarriedOptions, Search
+from holosplat.motion.flow_reconstruction import Carried, CarriedOptions, Search
 from holosplat.scan import Exposures, Scan
 
 MATTER = DeltaBeta(8e-7, 8e-10)

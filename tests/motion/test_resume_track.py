@@ -12,10 +12,10 @@ import torch
 from helpers.kept import Kept
 from helpers.moving_ellipsoids import MATERIAL, PIXEL, TIMES, scan, true_paths
 from holosplat.fit.schedule import Schedule
-from holosplat.motion import following, pieces
+from holosplat.motion import body_tracker, pieces
 from holosplat.motion.fit import motion_fit
-from holosplat.motion.halves import ASTRAY, astray, halves_of, standard_errors, tell_shapes
 from holosplat.motion.pieces import PathOptions
+from holosplat.motion.split_half_errors import ASTRAY, astray, halves_of, standard_errors, tell_shapes
 from holosplat.motion.track import TrackOptions, follow
 from holosplat.representations import TimeBasis
 
@@ -27,14 +27,14 @@ STAGES = ("sightings", "first paths", "stiff", "beside", "paths", "soft", "twins
 @pytest.fixture(autouse=True)
 def frequent(monkeypatch):
     """Fits are kept after every step, and each time sees the true bodies at once."""
-    monkeypatch.setattr(following, "CHECKPOINT_SECONDS", -1.0)
+    monkeypatch.setattr(body_tracker, "CHECKPOINT_SECONDS", -1.0)
     monkeypatch.setattr(
-        following, "sightings", lambda frames, material, options, network: seen(float(frames.instants[0]))
+        body_tracker, "sightings", lambda frames, material, options, network: seen(float(frames.instants[0]))
     )
 
 
 def seen(time: float):
-    return [following.Sighting(mesh, False) for mesh in true_paths().bodies(time)]
+    return [body_tracker.Detection(mesh, False) for mesh in true_paths().bodies(time)]
 
 
 def three_views():
@@ -42,7 +42,7 @@ def three_views():
 
 
 @cache
-def whole() -> tuple[Kept, following.Followed]:
+def whole() -> tuple[Kept, body_tracker.Followed]:
     kept = Kept()
     return kept, follow(scan(), MATERIAL, QUICK, journal=kept)
 
@@ -75,7 +75,7 @@ def test_the_fit_after_twins_goes_on_too(monkeypatch):
     def moved(run, bodies):
         return bodies.with_parameters({"coefficients": bodies.coefficients + 0.3})
 
-    monkeypatch.setattr(following.Following, "told_from_twins", moved)
+    monkeypatch.setattr(body_tracker.BodyTracker, "told_from_twins", moved)
     result = follow(scan(), MATERIAL, QUICK, journal=(kept := Kept()))
     named = [state["next"] for state in kept.plain]
     assert named.index("twins") < named.index("soft again") < named.index("halves")
@@ -87,7 +87,7 @@ def test_the_fit_after_twins_goes_on_too(monkeypatch):
 
 def test_ctrl_c_in_a_fit_loses_no_step(monkeypatch):
     """It is passed on, after the state is kept."""
-    monkeypatch.setattr(following, "CHECKPOINT_SECONDS", 1e9)
+    monkeypatch.setattr(body_tracker, "CHECKPOINT_SECONDS", 1e9)
 
     def stop(stage, fraction, record):
         if stage == "soft fit" and fraction > 0.5:
@@ -104,7 +104,7 @@ def test_ctrl_c_in_a_fit_loses_no_step(monkeypatch):
 
 def test_times_that_were_looked_at_are_not_looked_at_again(monkeypatch):
     """Cut off by Ctrl-C at the third time, of which nothing is kept."""
-    monkeypatch.setattr(following, "CHECKPOINT_SECONDS", 1e9)
+    monkeypatch.setattr(body_tracker, "CHECKPOINT_SECONDS", 1e9)
     looked = list[float]()
 
     def look(frames, *given, network):
@@ -113,17 +113,17 @@ def test_times_that_were_looked_at_are_not_looked_at_again(monkeypatch):
             raise KeyboardInterrupt
         return seen(looked[-1])
 
-    monkeypatch.setattr(following, "sightings", look)
+    monkeypatch.setattr(body_tracker, "sightings", look)
     with pytest.raises(KeyboardInterrupt):
         follow(scan(), MATERIAL, QUICK, journal=(kept := Kept()))
-    assert [(one["next"], len(one["steps"])) for one in kept.plain] == [("sightings", 2)]
+    assert [(one["next"], len(one["stage_steps"])) for one in kept.plain] == [("sightings", 2)]
     again = follow(scan(), MATERIAL, QUICK, journal=kept)
     assert len(looked) == TIMES + 1 + TIMES  # the third twice; and all beside the bodies
     assert torch.equal(again.bodies.coefficients, whole()[1].bodies.coefficients)
 
 
 def test_fits_of_the_choice_of_paths_are_not_made_again(monkeypatch):
-    monkeypatch.setattr(following, "CHECKPOINT_SECONDS", 1e9)
+    monkeypatch.setattr(body_tracker, "CHECKPOINT_SECONDS", 1e9)
     free, fits = replace(QUICK, paths=PathOptions(degree=1)), list[int]()
     result = follow(scan(), MATERIAL, free, journal=(every := Kept()))
     at = next(k for k, one in enumerate(every.plain) if one["next"] == "paths")
@@ -169,7 +169,7 @@ def test_halves_of_few_views_begin_apart(monkeypatch):
     assert 0.5 < float(one[0, own].square().sum(1).mean().sqrt()) / (ASTRAY * radius) < 3
     assert tell_shapes(scan())
     assert not tell_shapes(three_views())
-    monkeypatch.setattr(following.Following, "fitted", lambda run, name, frames, start, how, light: start)
+    monkeypatch.setattr(body_tracker.BodyTracker, "fitted", lambda run, name, frames, start, how, light: start)
     result = follow(three_views(), MATERIAL, QUICK)
     apart = result.halves[0].coefficients - result.halves[1].coefficients
     middle = 0.5 * (result.halves[0].coefficients + result.halves[1].coefficients)
@@ -183,8 +183,8 @@ def test_halves_that_begin_apart_are_fitted_to_the_end_where_no_shape_is_known(m
         steps.append((name, how.schedule.steps))
         return start
 
-    monkeypatch.setattr(following.Following, "fitted", fitted)
-    monkeypatch.setattr(following.Following, "on_chosen_paths", lambda run, bodies: bodies)
+    monkeypatch.setattr(body_tracker.BodyTracker, "fitted", fitted)
+    monkeypatch.setattr(body_tracker.BodyTracker, "on_chosen_paths", lambda run, bodies: bodies)
     long = replace(QUICK, soft=replace(QUICK.soft, schedule=Schedule(steps=7)))
     for frames, wanted in ((three_views(), [7, 7]), (scan(), [3, 3, 3, 3])):
         steps.clear()

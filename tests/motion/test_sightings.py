@@ -9,12 +9,11 @@ from scipy.ndimage import label
 from helpers.moving_ellipsoids import MATERIAL as OTHER
 from helpers.moving_ellipsoids import scan as of_ellipsoids
 from holosplat.beamline.simulate import simulate
-from holosplat.bodies.touching import parted
+from holosplat.bodies.cut import parted
 from holosplat.geometry import Views
 from holosplat.learning.start import LearnedStart
 from holosplat.materials import HAEMOGLOBIN
-from holosplat.motion.guesses import network_for
-from holosplat.motion.sightings import SightingOptions, sightings
+from holosplat.motion.detections import SightingOptions, network_for, sightings
 from holosplat.scan import Exposures
 from holosplat.specimens.red_cells import random_cells
 from holosplat.specimens.scene import MeshScene

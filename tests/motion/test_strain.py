@@ -10,7 +10,7 @@ from helpers.moving_ellipsoids import MATERIAL, PIXEL
 from holosplat.checks import InputError
 from holosplat.matter import Matter
 from holosplat.mesh import TriangleMesh
-from holosplat.motion.strain import strain_energy
+from holosplat.motion.elastic import strain_energy
 from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.specimens.membrane.model import Elasticity
 from holosplat.specimens.red_cells import icosphere

@@ -16,12 +16,20 @@ from holosplat.fit.schedule import Schedule
 from holosplat.geometry import Grid
 from holosplat.matter import Matter
 from holosplat.metrics import volume_scores
-from holosplat.motion import following
+from holosplat.motion import body_tracker
+from holosplat.motion.detections import sightings
 from holosplat.motion.fit import MotionFit, motion_fit
-from holosplat.motion.mergers import shared, without_merger
 from holosplat.motion.pieces import PathOptions, chosen_paths, refined
-from holosplat.motion.remainder import apart, beside, joined, only, sure_ones, whole_ones
-from holosplat.motion.sightings import sightings
+from holosplat.motion.residual_detection import (
+    apart,
+    beside,
+    joined,
+    only,
+    shared,
+    sure_ones,
+    whole_ones,
+    without_merger,
+)
 from holosplat.motion.track import TrackOptions, follow
 from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.specimens.red_cells import icosphere
@@ -42,7 +50,7 @@ def followed():
         return found[:1] if len(looks) <= TIMES else found
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(following, "sightings", blind)
+        patch.setattr(body_tracker, "sightings", blind)
         return follow(scan(), MATERIAL, QUICK)
 
 
@@ -174,7 +182,11 @@ def test_pieces_are_chosen_by_frames_that_are_held_out():
         chosen = 4 * np.repeat(order, 4) + np.tile(np.arange(4), 5)
         noise = 0.02 * np.random.default_rng(0).normal(size=scan().frames.shape)
         frames = replace(scan(), frames=scan().frames[chosen] + noise)
-        assert (chosen_paths(frames, start, how, short).basis.pieces > 1) == bent
+        found, decision = chosen_paths(frames, start, how, short)
+        assert (found.basis.pieces > 1) == bent
+        assert decision is not None
+        assert decision.choice == str(found.basis.pieces)
+        assert decision.by == "frames set aside"
 
 
 def test_one_time_is_no_motion():

@@ -18,10 +18,10 @@ from holosplat.fit.schedule import Schedule
 from holosplat.geometry import rotation_y
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.matter import Matter
-from holosplat.motion import twins
+from holosplat.motion import two_view_ambiguity
 from holosplat.motion.elastic import Elastic, Rest
 from holosplat.motion.fit import MotionFit
-from holosplat.motion.twins import Trials, chosen_twins, in_question, twinned, without_details
+from holosplat.motion.two_view_ambiguity import Trials, chosen_twins, in_question, twinned, without_details
 from holosplat.representations import MovingSurfaces, TimeBasis
 
 PIXEL, SHAPE = 1e-6, (29, 35)
@@ -104,7 +104,10 @@ def test_frames_tell_a_body_from_its_twin(monkeypatch):
     soft = MotionFit(schedule=Schedule(steps=10))
     trials = Trials(scan, Rest(Elastic(cell()), 100.0), stiff, soft, 2)
     heard = list[float]()
-    found = chosen_twins(twinned(truth, 0, ACROSS), trials, heard.append)
+    found, decision = chosen_twins(twinned(truth, 0, ACROSS), trials, heard.append)
+    assert decision is not None
+    assert decision.choice == "0"
+    assert {one.name: one.wins for one in decision.compared} == {"twin of body 0": True, "twin of body 1": False}
     for number, turn in enumerate((TURN, OTHER)):
         axes = np.linalg.eigh(moments(found.bodies(float(TIMES[1]))[number])[2])[1]
         assert abs(axes[:, 0] @ turn[:, 2]) > 0.98
@@ -113,11 +116,11 @@ def test_frames_tell_a_body_from_its_twin(monkeypatch):
     told = [*trials.steps.done]
     assert len(told) >= 4  # a stiff and a soft fit of a body and of its twin
     with monkeypatch.context() as none:
-        none.setattr(twins, "motion_fit", lambda *given: pytest.fail("this fit was made before"))
-        again = chosen_twins(twinned(truth, 0, ACROSS), replace(trials, steps=Steps(told)))
+        none.setattr(two_view_ambiguity, "motion_fit", lambda *given: pytest.fail("this fit was made before"))
+        again, _ = chosen_twins(twinned(truth, 0, ACROSS), replace(trials, steps=Steps(told)))
     assert torch.equal(again.coefficients, found.coefficients)
-    assert chosen_twins(truth, replace(trials, steps=Steps())) is truth
+    assert chosen_twins(truth, replace(trials, steps=Steps()))[0] is truth
     other = hs.Views.from_angles(np.array([0.0, 30.0, 48.0]), SHAPE, PIXEL)
     three = hs.Exposures.of(other, 20.0, 0.05).repeated(TIMES[:2])
     blank = hs.Scan(np.ones((6, *SHAPE), dtype=np.float32), three, np.zeros(6, dtype=bool))
-    assert chosen_twins(truth, replace(trials, train=blank)) is truth
+    assert chosen_twins(truth, replace(trials, train=blank)) == (truth, None)

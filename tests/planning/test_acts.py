@@ -17,7 +17,7 @@ from holosplat.align import PoseOptions
 from holosplat.geometry import Views
 from holosplat.learning.network import FINE, Size
 from holosplat.methods import METHODS, Pinn, SurfaceOptions
-from holosplat.motion.carried import CarriedOptions
+from holosplat.motion.flow_reconstruction import CarriedOptions
 from holosplat.motion.track_options import TrackOptions
 from holosplat.planning import acts
 from holosplat.planning.needs import Needs, Sizes, coarser, of_fit, of_reconstruction

@@ -9,26 +9,24 @@ import numpy as np
 import torch
 
 from ..checks import require
+from ..inference import Decision, Score
 from ..matter import DeltaBeta, Known, MaterialPrior
 from ..methods.assumed import assumed_material
 from ..model import Alignment
 from ..optics.background import Light, LightOptions
 from ..progress import Advance, Progress
 from ..scan import Exposures, Scan
-from .begin import Begun, Images, begun
 from .changes import changes, header, in_words, line
-from .coarse import SIDES
+from .consistency import Estimate
 from .derivatives import NUMBERS
-from .few import KINDS
 from .gauge import moved_onto
-from .moments import Beams, Moment, chosen_moments, whens
+from .initial_geometry import SIDES, Images, RowGeometry, geometry_from_rows
 from .poses import DISTANCE, FLUX, SHIFT, TURN, Drift, Level, PoseOptions, PoseSearch
-from .series_search import SeriesSearch
+from .series_search import Beams, Moment, SeriesSearch, chosen_moments, whens
 from .shadows import EVEN_OR_NOT
-from .views import ACCURACY, DEFAULT, FEW, FEWEST, AlignedViews, Judged
+from .views import DEFAULT, FEW, FEWEST, PLANNED, AlignedViews, Judged, decided_poses
 
-SURE = 3.0
-"""A drift is beyond doubt where some number of a beam has so many of its standard errors."""
+DRIFT, STAY, LINEAR = "drift of the beams", "none", "linear in time"
 JUDGED = 3
 """Times whose volumes judge what volumes found."""
 ACROSS = "shifts across two beams are as planned: they are a motion of the whole object, which loses nothing"
@@ -45,7 +43,8 @@ class Found:
     numbers, rates: [B, 8] of `NUMBERS` at the middle of the series, and how much more at its end
     errors, rate_errors: [B, 5] of those of the pose
     before, after: [B] of what `measure` says
-    pixels: of the images they were found on; words: about it
+    pixels: of the images they were found on; words: about it; left: of the rows or frames, before and after; decisions:
+    that led to it
     """
 
     numbers: np.ndarray
@@ -57,6 +56,8 @@ class Found:
     measure: str
     pixels: int
     words: list[str]
+    left: tuple[Score, Score] | None = None
+    decisions: tuple[Decision, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,6 +111,7 @@ class AlignedBeams(AlignedViews):
             in_words(self.beams),
             f"{self.measure}: {before:.4f} as planned, {after:.4f} now",
             *self.words,
+            *(each.line for each in self.decisions),
             header("beam", 2),
             *(line(b, self.beams[b], self.errors[frame], 2) for b, frame in enumerate(first)),
         ]
@@ -172,11 +174,14 @@ def align_beams(
         found.words.extend(f"beam {b} is reversed along {side}: its frames were turned back" for b, side in reversed_)
     if held:
         found.words.append(DISTANCES)
-    found = _keep_planned(_without_doubtful_drift(found, options), beams.planned, options)
-    telling = by_rows or count >= options.few_views  # volumes of few frames agree with any poses
-    if telling and (found.numbers.any() or found.rates.any()) and np.mean(found.after**2) > np.mean(found.before**2):
-        found = replace(found, numbers=0 * found.numbers, rates=0 * found.rates, after=found.before)
-        found.words.append("all is as planned: what was found explains the frames no better")
+    if start is not None:
+        found = replace(found, decisions=(start.decision,))
+    found = _without_doubtful_drift(found, options)
+    if found.left is not None and (by_rows or count >= options.few_views):  # volumes of few frames agree with any poses
+        decision = decided_poses(*found.left, "the same rows" if by_rows else "training frames")
+        found = replace(found, decisions=(*found.decisions, decision))
+        if decision.choice == PLANNED:
+            found = replace(found, numbers=0 * found.numbers, rates=0 * found.rates, after=found.before)
     return _place_frames(scan, beams, found, times, start.sides if start else ("",) * len(beams))
 
 
@@ -197,23 +202,24 @@ def _turned_back(moment: Moment, sides: tuple[str, ...]) -> Moment:
 
 def _rows(
     moments: Sequence[Moment], count: int, material: DeltaBeta, options: PoseOptions, few: bool, pixels: int
-) -> Begun | None:
+) -> RowGeometry | None:
     """Estimate the beams from rows, at times that have all of them, on pixels so many times larger."""
     whole = [moment for moment in moments if len(moment.beams) == count]
     if not whole:
         return None
     scans = [moment.scan[np.argsort(moment.beams)].binned(pixels) for moment in whole]
     images = Images.of(scans, [moment.when for moment in whole], material, options.retrieval)
-    return begun(images, options.uncertain.pose(pixels), options.drift.pose(pixels), few)
+    return geometry_from_rows(images, options.uncertain.pose(pixels), options.drift.pose(pixels), few)
 
 
-def _by_rows(start: Begun, pixels: int) -> Found:
+def _by_rows(start: RowGeometry, pixels: int) -> Found:
     """The numbers of rows, for detector pixels."""
     scales = np.array([pixels, pixels, 1, 1, 1])
     numbers, rates = (np.pad(scales * part, ((0, 0), (0, len(NUMBERS) - 5))) for part in (start.numbers, start.rates))
     errors, rate_errors = scales * start.errors, scales * start.rate_errors
-    measure = "rows disagree by this share of their moments"
-    return Found(numbers, rates, errors, rate_errors, start.before, start.after, measure, pixels, list(start.words))
+    measure, words = "rows disagree by this share of their moments", list(start.words)
+    both = start.before, start.after
+    return Found(numbers, rates, errors, rate_errors, *both, measure, pixels, words, start.left)
 
 
 def _shifted_by_volumes(search: SeriesSearch, found: Found, on_progress: Advance) -> Found:
@@ -228,7 +234,7 @@ def _shifted_by_volumes(search: SeriesSearch, found: Found, on_progress: Advance
 
 
 def _by_volumes(
-    search: SeriesSearch, planned: Exposures, start: Begun | None, few: bool, pixels: int, on_progress: Progress
+    search: SeriesSearch, planned: Exposures, start: RowGeometry | None, few: bool, pixels: int, on_progress: Progress
 ) -> Found:
     """The numbers of volumes of all times, which begin with those of rows where these agree; turns of `few` beams stay
     as they begin."""
@@ -261,22 +267,25 @@ def _by_volumes(
     )
     on_progress("alignment, before and after", 0.0)
     still = replace(found, numbers=0 * numbers, rates=0 * rates)
-    before, after = (_residuals(search, planned, each) for each in (still, found))
+    (before, first), (after, then) = (_residuals(search, planned, each) for each in (still, found))
     on_progress("alignment, before and after", 1.0)
-    return replace(found, before=before, after=after)
+    return replace(found, before=before, after=after, left=(first, then))
 
 
-def _residuals(search: SeriesSearch, planned: Exposures, found: Found) -> np.ndarray:
-    """[B] rms of what volumes of some times leave of the frames of each beam, as a share of their contrast."""
+def _residuals(search: SeriesSearch, planned: Exposures, found: Found) -> tuple[np.ndarray, Score]:
+    """[B] rms of what volumes of some times leave of the frames of each beam, as a share of their contrast; and what
+    they leave of the training frames."""
     some = np.unique(np.linspace(0, len(search.moments) - 1, min(JUDGED, len(search.moments))).round().astype(int))
-    sums, counts = np.zeros(len(planned)), np.zeros(len(planned))
+    sums, counts, scores = np.zeros(len(planned)), np.zeros(len(planned)), list[Score]()
     for k in some:
         moment = search.moments[k]
         exposures = _exposures(found.numbers + moment.when * found.rates, planned)[moment.beams]
         pixels = max(found.pixels, 2 if min(moment.scan.views.shape) >= 2 * search.options.least_side else 1)
-        sums[moment.beams] += Judged.of(moment.scan, exposures, search.searches[k], pixels).left ** 2
+        judged = Judged.of(moment.scan, exposures, search.searches[k], pixels)
+        sums[moment.beams] += judged.left**2
         counts[moment.beams] += 1
-    return np.sqrt(sums / np.maximum(counts, 1))
+        scores.append(judged.score(~moment.scan.is_test))
+    return np.sqrt(sums / np.maximum(counts, 1)), Score.joined(scores)
 
 
 def _exposures(numbers: np.ndarray, planned: Exposures) -> Exposures:
@@ -289,26 +298,12 @@ def _without_doubtful_drift(found: Found, options: PoseOptions) -> Found:
     """The same without a drift that may be none, and with a word about it."""
     if not options.drift.pose().any():
         return found
-    sizes = np.abs(found.rates[:, :5])[found.rate_errors > 0] / found.rate_errors[found.rate_errors > 0]
-    if sizes.size and sizes.max() > SURE:
-        found.words.append("the drift is beyond doubt")
-        return found
-    found.words.append(f"no drift: what was found of it is less than {SURE:g} of its standard errors")
-    return replace(found, rates=0 * found.rates)
-
-
-def _keep_planned(found: Found, planned: Exposures, options: PoseOptions) -> Found:
-    """The same with those kinds of numbers as planned that differ from it by no more than can be known."""
-    numbers = found.numbers.copy()
-    here = _exposures(numbers, planned)
-    moved = changes(replace(here, views=moved_onto(here.views, planned.views)), planned)
-    for kind, places in KINDS.items():
-        limit = ACCURACY.get(kind, 0.0) * (found.pixels if kind == "shift" else 1)
-        drifts = found.rates[:, list(places)].any()
-        if not drifts and getattr(options.uncertain, kind) > 0 and _rms(moved[:, list(places)]) < limit:
-            numbers[:, list(places)] = 0
-            found.words.append(f"{kind} is as planned: the frames agree with it to within the accuracy of {limit:g}")
-    return replace(found, numbers=numbers)
+    told = found.rate_errors > 0
+    sizes = (np.abs(found.rates[:, :5]) * told / np.where(told, found.rate_errors, 1.0)).max(initial=0.0)
+    surest = Estimate(float(sizes), 1.0).compared(LINEAR)
+    decision = Decision(DRIFT, LINEAR if surest.wins else STAY, "likelihood ratio of the surest number", (surest,))
+    kept = found if surest.wins else replace(found, rates=0 * found.rates)
+    return replace(kept, decisions=(*found.decisions, decision))
 
 
 def _place_frames(scan: Scan, beams: Beams, found: Found, times: np.ndarray, sides: tuple[str, ...]) -> AlignedBeams:
@@ -328,6 +323,7 @@ def _place_frames(scan: Scan, beams: Beams, found: Found, times: np.ndarray, sid
         found.before[which],
         found.after[which],
         tuple(found.words),
+        found.decisions,
         sides=tuple(sides[b] for b in which),
         of_frame=which,
         beams=middle,
@@ -342,7 +338,3 @@ def _changes(numbers: np.ndarray, planned: Exposures) -> np.ndarray:
     """Changes [B, 7] of the plan, all beams moved together as near to it as can be."""
     found = _exposures(numbers, planned)
     return changes(replace(found, views=moved_onto(found.views, planned.views)), planned)
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(values**2)))

@@ -20,12 +20,10 @@ from ..progress import Progress
 from ..ranges import Pixels, ranged
 from ..scan import Exposures, Scan
 from .changes import changes, header, line
-from .coarse import shifts_by_mass
 from .derivatives import NUMBERS
 from .gauge import moved_onto
-from .phantom import Phantom
-from .phantom_fit import STEPS, Linear, linearised, solved
-from .phantom_start import find_beads, placed
+from .initial_geometry import shifts_by_mass
+from .phantom import STEPS, Linear, Phantom, find_beads, linearised, placed, solved
 from .poses import DISTANCE, FLUX, SHIFT, TURN, Uncertain
 from .shadows import EVEN_OR_NOT
 from .views import KINDS

@@ -15,11 +15,11 @@ from ..optics.sampling import fringe_sampling
 from ..progress import Progress
 from ..representations import Stored
 from ..scan import Scan
-from .beside import Beside
 from .changes import changes, numbers_of
-from .coarse import centres_of_mass
 from .derivatives import NUMBERS, in_pixels
-from .newton import unexplained
+from .fixed_matter import Beside
+from .initial_geometry import centres_of_mass
+from .newton import rms_of, unexplained
 from .poses import DISTANCE, FLUX, SHIFT, PoseOptions, PoseSearch
 from .views import AlignedViews, errors_of
 
@@ -62,7 +62,9 @@ def place_frames(
     beside = Beside(found, scan.exposures, oversample or fringe_sampling(scan.exposures))
     measured, nothing = torch.from_numpy(scan.frames), torch.zeros_like(search.numbers)
     moved = beside.placed(measured, search.numbers, _expected(options))
-    tried = [unexplained(measured, beside.frames(numbers)) for numbers in (nothing, search.numbers, moved.numbers)]
+    tried = [
+        rms_of(unexplained(measured, beside.frames(numbers))) for numbers in (nothing, search.numbers, moved.numbers)
+    ]
     before, after = tried[0], np.minimum(tried[1], tried[2])
     search.numbers = torch.where(torch.from_numpy(tried[2] <= tried[1])[:, None], moved.numbers, search.numbers)
     worse = after > before
@@ -116,6 +118,6 @@ def fitted_frames(found: Stored, planned: Scan, fitted: Scan, options: PoseOptio
     measured, nothing = torch.from_numpy(fitted.frames), torch.zeros_like(numbers)
     beside = Beside(found, planned.exposures, oversample or fringe_sampling(planned.exposures))
     errors = errors_of(beside.placed(measured, numbers, _expected(options), steps=0).covariances)
-    before, after = (unexplained(measured, beside.frames(each)) for each in (nothing, numbers))
+    before, after = (rms_of(unexplained(measured, beside.frames(each))) for each in (nothing, numbers))
     moved = changes(fitted.exposures, planned.exposures)
     return AlignedViews(fitted.exposures, moved, errors, np.zeros(len(planned)), before, after, ())

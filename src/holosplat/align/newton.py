@@ -73,7 +73,11 @@ def blurred(images: Tensor, sigma: float) -> Tensor:
     return torch.fft.irfft2(torch.fft.rfft2(images) * torch.exp(-2 * math.pi**2 * sigma**2 * squares), s=(h, w))
 
 
-def unexplained(measured: Tensor, images: Tensor) -> np.ndarray:
-    """[V] rms of what images [V, H, W] leave of frames, as a share of each frame's contrast."""
-    left = (measured - images).square().mean((1, 2)).sqrt() / measured.std(dim=(1, 2)).clamp_min(1e-12)
-    return left.double().numpy()
+def unexplained(measured: Tensor, images: Tensor) -> Tensor:
+    """[V, H, W] what images leave of frames, over each frame's contrast."""
+    return (measured - images) / measured.std(dim=(1, 2), keepdim=True).clamp_min(1e-12)
+
+
+def rms_of(images: Tensor) -> np.ndarray:
+    """[V] root mean squares of images [V, H, W]."""
+    return images.double().square().mean((1, 2)).sqrt().numpy()

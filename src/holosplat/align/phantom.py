@@ -1,18 +1,31 @@
-"""A body of known shape in unknown pose, or beads of known radius in unknown places: what calibrates beams."""
+"""Phantoms of a calibration: their shapes, first poses, and least squares of all parameters."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy.ndimage import gaussian_filter, maximum_filter
+from scipy.spatial.transform import Rotation
+from torch import Tensor
 
+from ..baselines import TOMOGRAPHIES
 from ..checks import positive, require
+from ..geometry import Grid, Views
 from ..matter import DeltaBeta, Matter
 from ..mesh import TriangleMesh
+from ..model import Alignment, Instrument
+from ..projectors.surface import surface_occupancy
 from ..representations import SurfaceMesh
+from ..scan import Exposures
 from ..specimens.red_cells import icosphere
+from ..volume import LineIntegrals
+from .derivatives import NUMBERS, in_pixels
+from .initial_geometry import centres_of_mass, shifts_by_mass
+from .newton import blurred
 
 FINENESS = 3
 """Bisections of an icosahedron that stands for a bead: 1280 triangles, off a ball by 0.4 % of the radius."""
@@ -84,3 +97,217 @@ def centre_of_mass(mesh: TriangleMesh) -> np.ndarray:
     total = float(volumes.sum())
     require(total > 0, f"{mesh.name} must be a closed mesh wound outwards, but it encloses no volume; repair it.")
     return origin + volumes @ (a + b + c) / (4 * total)
+
+
+TRIALS = 600
+"""Turns that are tried: random ones are within 25° of any, or nearly so."""
+CHOSEN = 6
+"""The best of them, which are improved."""
+SMALLEST = 0.7
+"""Degrees by which the turn is improved in the end; least squares does the rest."""
+SEEN, LEAST = 0.5, 0.15
+"""Share of what the fullest bead holds that another must hold, for all are of one size, and of a ball's volume."""
+APART = 1.5
+"""Least distance of two beads' centres [radii]; beads that touch have two."""
+
+
+def placed(phantom: Phantom, thickness: np.ndarray, views: Views) -> tuple[Phantom, np.ndarray]:
+    """The phantom where its shadows are, and the shifts [V, 2] [pixels] of the views beside `views`.
+
+    thickness: [V, H, W] of the phantom's matter [m]; all of it lies in every field.
+    """
+    shifts = shifts_by_mass(thickness, views)
+    seen = centres_of_mass(thickness) + views.shifts / views.pixel_size + shifts
+    point = np.linalg.lstsq(views.rotations[:, :2].reshape(-1, 3), seen.reshape(-1), rcond=1e-9)[0]
+    there = replace(views, shifts=views.shifts + shifts * views.pixel_size)
+    turn = best_turn(phantom, thickness / views.pixel_size, in_pixels(there), point, views.pixel_size)
+    return phantom.moved(turn, point * views.pixel_size), shifts
+
+
+def best_turn(phantom: Phantom, lines: np.ndarray, views: Views, point: np.ndarray, pixel: float) -> np.ndarray:
+    """The turn [3, 3] of a rigid phantom about its centre, `point` [pixels], that fits `lines` [V, H, W] best."""
+    points, weights = inside(phantom, pixel)
+    target = np.stack([gaussian_filter(image, 1.0) for image in lines])
+
+    def misfit(turn: np.ndarray) -> float:
+        images = shadows_of(points @ turn.T + point, weights, views)
+        return float(np.square(target - images).sum())
+
+    trials = [np.eye(3), *Rotation.random(TRIALS, rng=np.random.default_rng(0)).as_matrix()]
+    values = [misfit(turn) for turn in trials]
+    found = [_improved(misfit, trials[k], values[k]) for k in np.argsort(values)[:CHOSEN]]
+    return min(found, key=lambda pair: pair[1])[0]
+
+
+def inside(phantom: Phantom, pixel: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points [P, 3] in a rigid phantom about its centre [pixels], and the volumes [P] that they stand for."""
+    mesh = phantom.shapes[0]
+    low, high = mesh.bounds
+    shape = tuple(int(np.ceil(n)) for n in ((high - low) / pixel + 2)[::-1])
+    vertices = torch.from_numpy((mesh.vertices - low) / pixel + 0.5)
+    occupancy = surface_occupancy(vertices, torch.from_numpy(mesh.faces), (shape[0], shape[1], shape[2])).numpy()
+    z, y, x = np.nonzero(occupancy)
+    return np.stack([x, y, z], axis=1) - 0.5 + low / pixel, occupancy[z, y, x]
+
+
+def shadows_of(points: np.ndarray, weights: np.ndarray, views: Views) -> np.ndarray:
+    """Blurred projections [V, H, W] of points [P, 3] with volumes [P]; lengths in pixels."""
+    h, w = views.shape
+    images = np.empty((len(views), h, w))
+    for v, (rotation, shift) in enumerate(zip(views.rotations, views.shifts)):
+        x, y = (points @ rotation[:2].T - shift + 0.5 * np.array([w - 1, h - 1])).T
+        column, row = np.floor(x).astype(int), np.floor(y).astype(int)
+        image = np.zeros(h * w)
+        for j, i in ((0, 0), (1, 0), (0, 1), (1, 1)):
+            near = np.abs(1 - j - (x - column)) * np.abs(1 - i - (y - row))
+            at_x, at_y = column + j, row + i
+            kept = (at_x >= 0) & (at_x < w) & (at_y >= 0) & (at_y < h)
+            image += np.bincount(at_y[kept] * w + at_x[kept], (weights * near)[kept], h * w)
+        images[v] = gaussian_filter(image.reshape(h, w), 1.0)
+    return images
+
+
+def _improved(misfit: Callable[[np.ndarray], float], turn: np.ndarray, value: float) -> tuple[np.ndarray, float]:
+    """A turn [3, 3] near `turn` and its misfit: steps about six axes, each half as long once none is better."""
+    degrees = 12.0
+    while degrees > SMALLEST:
+        steps = Rotation.from_rotvec(degrees * np.concatenate([np.eye(3), -np.eye(3)]), degrees=True).as_matrix()
+        tried = steps @ turn
+        values = [misfit(each) for each in tried]
+        best = int(np.argmin(values))
+        if values[best] < value:
+            turn, value = tried[best], values[best]
+        else:
+            degrees /= 2
+    return turn, value
+
+
+def find_beads(thickness: Tensor, views: Views, radius: float) -> np.ndarray:
+    """Centres [N, 3] [m] of balls of `radius` [m] in the volume of total-variation tomography of `thickness` [m].
+
+    A centre is where a ball holds more of the occupancy than anywhere within `APART` radii, and enough (`SEEN`).
+    Errors: `InputError` where there is none, and for balls of less than a pixel.
+    """
+    from scipy.signal import fftconvolve  # which imports all of scipy.stats
+
+    pixel = views.pixel_size
+    reach = radius / pixel
+    require(reach >= 1, f"beads must have a radius of a pixel at least, but --beads is {reach:.2g} pixels; correct it.")
+    grid = Grid.of_views(views)
+    values = TOMOGRAPHIES["tv"](thickness, views, grid, 1.0, lambda fraction: None).numpy().astype(np.float64)
+    ball = np.clip(reach + 0.5 - _distances(reach), 0, 1)
+    held = fftconvolve(values, ball / ball.sum(), mode="same")
+    tops = np.argwhere((held == maximum_filter(held, 3)) & (held > max(LEAST, SEEN * held.max())))
+    peaks = np.zeros((0, 3))
+    for top in tops[np.argsort(-held[tuple(tops.T)])]:  # the fullest first
+        if np.all(np.linalg.norm(peaks - top, axis=1) > APART * reach):
+            peaks = np.vstack([peaks, top])
+    require(len(peaks) > 0, "the frames show no bead of this radius; check --beads, the material and the pixel size.")
+    return np.array(grid.origin) + peaks[:, ::-1] * pixel
+
+
+def _distances(reach: float) -> np.ndarray:
+    """Distances [n, n, n] from the middle of a cube of voxels that reaches so far [voxels]."""
+    squares = np.square(np.arange(-np.ceil(reach), np.ceil(reach) + 1.0))
+    return np.sqrt(squares[:, None, None] + squares[:, None] + squares)
+
+
+STEPS = (0.05, 0.05, 1e-3, 1e-3, 1e-3)
+"""Small changes of shifts [pixels] and turns [rad] by which derivatives are taken."""
+STRETCH = 5e-3
+"""The same for the logarithms of the distance and of the pixel size."""
+NUDGE = 0.05
+"""The same for the place of a bead [pixels]."""
+
+
+@dataclass(frozen=True)
+class Linear:
+    """Frames [V, H, W] of a phantom, and their derivatives: of_views [V, 8, H, W] by the `NUMBERS` of each view (zero
+    by the magnification, for there is one of all), of_all [K, V, H, W] by the places of free bodies [pixels] and, last,
+    the logarithm of the pixel size."""
+
+    frames: Tensor
+    of_views: Tensor
+    of_all: Tensor
+
+
+def linearised(phantom: Phantom, exposures: Exposures, material: DeltaBeta, oversample: int, pixel: bool) -> Linear:
+    """The frames in `exposures` and their derivatives, by differences; pixel: whether that by its size is asked for."""
+    instrument, pitch = Instrument(exposures, oversample), exposures.views.pixel_size
+    matter, count = phantom.surfaces(material, pitch), len(exposures)
+    lines = matter.project(instrument.poses)
+
+    def seen(channels: Tensor, through: Instrument = instrument) -> Tensor:
+        return through.frames(LineIntegrals(channels, lines.materials)).detach().double()
+
+    here = seen(lines.channels)
+    columns = []
+    for k, step in enumerate(STEPS):
+        name, width = ("shifts", 2) if k < 2 else ("turns", 3)
+        changed = torch.zeros(count, width, dtype=torch.float64)
+        changed[:, k if k < 2 else k - 2] = step
+        poses = Alignment(**{name: changed}).poses(instrument.poses, pitch)
+        columns.append((seen(matter.project(poses).channels) - here) / step)
+    farther = Instrument(replace(exposures, distance=exposures.distance * math.exp(STRETCH)), oversample)
+    columns += [(seen(lines.channels, farther) - here) / STRETCH, torch.zeros_like(here), here]
+    others = []
+    for n in range(len(phantom) if phantom.free else 0):
+        before = phantom.surfaces(material, pitch, [n]).project(instrument.poses).channels
+        for k in range(3):
+            by = np.zeros((len(phantom), 3))
+            by[n, k] = NUDGE * pitch
+            after = phantom.shifted(by).surfaces(material, pitch, [n]).project(instrument.poses).channels
+            others.append((seen(lines.channels + after - before) - here) / NUDGE)
+    if pixel:
+        views = replace(exposures.views, pitch=pitch * math.exp(STRETCH))
+        views = replace(views, shifts=views.shifts * math.exp(STRETCH))
+        larger = Instrument(replace(exposures, views=views), oversample)
+        there = phantom.surfaces(material, views.pixel_size).project(larger.poses)
+        others.append((larger.frames(there).detach().double() - here) / STRETCH)
+    together = torch.stack(others) if others else torch.zeros(0, *here.shape, dtype=torch.float64)
+    return Linear(here, torch.stack(columns, dim=1), together)
+
+
+@dataclass(frozen=True)
+class Solution:
+    """of_views: [V, 8] and of_all: [K] after a step; covariances: [K + 8 V] squared, those of all first."""
+
+    of_views: Tensor
+    of_all: Tensor
+    covariances: Tensor
+
+
+def solved(
+    measured: Tensor, found: Linear, numbers: tuple[Tensor, Tensor], expected: tuple[Tensor, Tensor], blur: float
+) -> Solution:
+    """One Gauss–Newton step of all numbers together, damped by what is expected of them.
+
+    measured: [V, H, W]; numbers: of views [V, 8] and of all [K], now; expected: [8] and [K] standard deviations about
+    zero, 0 for those that stay. The noise of a view is what it leaves unexplained after a Gaussian of `blur` [pixels].
+    """
+    views, count = len(measured), len(numbers[1])
+    missing = blurred(measured.double() - found.frames, blur).flatten(1)
+    of_views = blurred(found.of_views, blur).flatten(2)
+    of_all = (blurred(found.of_all, blur) if count else found.of_all).flatten(2)
+    independent = 1 / (4 * math.pi * blur**2)
+    scale = independent / missing.square().mean(1).clamp_min(1e-18)
+    size = count + len(NUMBERS) * views
+    information, slope = torch.zeros(size, size, dtype=torch.float64), torch.zeros(size, dtype=torch.float64)
+    information[:count, :count] = torch.einsum("kvp,lvp,v->kl", of_all, of_all, scale)
+    slope[:count] = torch.einsum("kvp,vp,v->k", of_all, missing, scale)
+    for v in range(views):
+        at = slice(count + len(NUMBERS) * v, count + len(NUMBERS) * (v + 1))
+        information[at, at] = scale[v] * of_views[v] @ of_views[v].T
+        information[:count, at] = scale[v] * of_all[:, v] @ of_views[v].T
+        information[at, :count] = information[:count, at].T
+        slope[at] = scale[v] * of_views[v] @ missing[v]
+    flat = torch.cat([numbers[1], numbers[0].flatten()])
+    deviations = torch.cat([expected[1], expected[0].repeat(views)])
+    free = torch.nonzero(deviations > 0)[:, 0]
+    prior = deviations[free] ** -2
+    covariance = torch.linalg.inv(information[free[:, None], free] + torch.diag(prior))
+    after = flat.clone()
+    after[free] += covariance @ (slope[free] - prior * flat[free])
+    whole = torch.zeros(size, size, dtype=torch.float64)
+    whole[free[:, None], free] = covariance
+    return Solution(after[count:].reshape(views, len(NUMBERS)), after[:count], whole)

@@ -22,8 +22,8 @@ from ..progress import Advance
 from ..projectors.voxels import LatticeProjector
 from ..ranges import Angle, Pixels, Weight, ranged
 from ..scan import Exposures, Scan
-from .coarse import shifts_by_mass
 from .derivatives import NUMBERS, in_pixels, predicted
+from .initial_geometry import shifts_by_mass
 from .newton import Normal, step, unexplained
 
 SHIFT, TURN, DISTANCE, MAGNIFICATION, FLUX = slice(0, 2), slice(2, 5), 5, 6, 7
@@ -97,11 +97,6 @@ class Drift:
 
 TURNING = 30
 """Pixels along a frame's shorter side from which on turns are looked for: on larger pixels there are shifts alone."""
-NEAR, SETTLED = 0.05, 0.01
-"""Rms steps of shifts [pixels of a level] at which a level ends: surfaces find the rest of the former in a few steps;
-steps of the latter are a third of what voxels leave in the end."""
-SLOWER = 0.9
-"""Steps of shifts that are not shorter than this part of those before fall no longer."""
 BLUR_AS_DISTANCE = 0.02
 """Share of the distance that is free where the distance is known: it takes up what the edges of voxels are too soft
 for, which would else be taken for something else. What is found of it is forgotten."""
@@ -218,23 +213,23 @@ class PoseSearch:
         assert self._solver is not None
         return self._solver.volume
 
-    def unexplained(self, scan: Scan) -> np.ndarray:
-        """[V] what the volume leaves of the frames of `scan`, on its pixels, as a share of their contrast."""
+    def residuals(self, scan: Scan) -> Tensor:
+        """[V, H, W] what the volume leaves of the frames of `scan`, on its pixels, over their contrast."""
         grid, found = Grid.of_views(in_pixels(scan.views)), self.exposures(scan.exposures)
         images = predicted(self.volume, grid, found, self.material, fringe_sampling(scan.exposures)).frames
         return unexplained(torch.from_numpy(scan.frames), self.numbers[:, FLUX].exp().float()[:, None, None] * images)
 
     def run(self, level: Level, on_progress: Advance) -> None:
-        """The rounds of a level, until shifts have settled, or their steps fall no longer."""
+        """The rounds of a level, until steps of the shifts are within their standard errors, or fall no longer."""
         at, last = self.prepared(level), math.inf
         trained = torch.from_numpy(~self.scan.is_test)
         for done in range(level.rounds):
             before = self.numbers[:, SHIFT].clone()
             self.solve(self.looked(at), at.shape)
             self.numbers[:, MAGNIFICATION] -= self.numbers[trained, MAGNIFICATION].mean()
-            moved = float((self.numbers[:, SHIFT] - before).square().mean().sqrt()) / level.pixels
+            moved = float((self.numbers[:, SHIFT] - before).square().mean())
             on_progress((done + 1) / level.rounds)
-            if moved < (NEAR if self.edges_follow else SETTLED) or moved > SLOWER * last:
+            if moved <= float(self.covariances.diagonal(dim1=1, dim2=2)[:, SHIFT].mean()) or moved >= last:
                 break
             last = moved
         on_progress(1.0)

@@ -11,13 +11,14 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from ..geometry import Grid
+from ..inference import Decision
 from ..methods.surface_fit import oversampling
 from ..optics.sampling import fringe_sampling
 from ..representations import SurfaceMesh
 from ..scan import Scan
-from .beside import Beside
 from .changes import numbers_of
 from .derivatives import in_pixels, predicted
+from .fixed_matter import Beside
 from .gauge import moved_onto
 from .poses import FLUX, SHIFT, PoseOptions, PoseSearch
 
@@ -29,12 +30,14 @@ SEED = 0
 class Searched:
     """A search that is done.
 
-    pixels: edge of the last images [detector pixels]; surfaces: what explains frames better than voxels, or None
+    pixels: edge of the last images [detector pixels]; surfaces: what explains frames better than voxels, or None;
+    decisions: on these
     """
 
     search: PoseSearch
     pixels: int
     surfaces: SurfaceMesh | None
+    decisions: tuple[Decision, ...] = ()
 
 
 Search = Callable[[Scan, PoseOptions], Searched]

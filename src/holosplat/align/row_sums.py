@@ -14,6 +14,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d, map_coordinates
 
 from ..geometry import Views
+from ..inference import Score
 
 COUNT = 6
 """Numbers of each view: shifts x, y [pixels], turns about x, y, z of the lab [rad], as `derivatives.NUMBERS` begins;
@@ -99,6 +100,7 @@ class RowEstimate:
     information, rate_information: [V · 6, V · 6] of either, without what is expected
     covariance: [2 · V · 6, 2 · V · 6] of numbers and rates, with it; 0 for those that stay
     before, after: [V] rms of what the view's rows have against being of one object, as a share of all rows' moments
+    left: the same after it, a block for `ALIKE` rows of a view at a time, a band for the masses and the first moments
     """
 
     numbers: np.ndarray
@@ -108,6 +110,7 @@ class RowEstimate:
     covariance: np.ndarray
     before: np.ndarray
     after: np.ndarray
+    left: Score
 
 
 def by_rows(images: np.ndarray, views: Views, prior: RowPrior, when: np.ndarray) -> RowEstimate:
@@ -139,7 +142,8 @@ def by_rows(images: np.ndarray, views: Views, prior: RowPrior, when: np.ndarray)
         covariance[np.ix_(free, free)] = np.linalg.inv(hessian)
     noise = _noise(residuals, images.shape[2])
     own, moving = (columns[:, part].T @ columns[:, part] / noise for part in (slice(half), slice(half, None)))
-    return RowEstimate(both[0], both[1], own, moving, covariance, before, stack.by_view(residuals))
+    after, left = stack.by_view(residuals), stack.score(residuals)
+    return RowEstimate(both[0], both[1], own, moving, covariance, before, after, left)
 
 
 def _noise(residuals: np.ndarray, height: int) -> float:
@@ -179,6 +183,13 @@ class _Stack:
         rows = [Rows.of(at) for at in self.images]
         moments = [(w * part) ** 2 for r in rows for w, part in zip(self.weights, (r.mass, r.first))]
         return np.sqrt((residuals.reshape(times, 2, views, -1) ** 2).mean((0, 1, 3)) / np.mean(moments))
+
+    def score(self, residuals: np.ndarray) -> Score:
+        """Of residuals [R]."""
+        times, views, height = self.images.shape[:3]
+        size = min(ALIKE, height)
+        rows = np.square(residuals.reshape(times, 2, views, height)[..., : height - height % size])
+        return Score(rows.reshape(times, 2, views, -1, size).mean(-1).swapaxes(1, 3).reshape(-1, 2))
 
 
 def replaced(images: np.ndarray, shifts: np.ndarray, rolls: np.ndarray) -> np.ndarray:

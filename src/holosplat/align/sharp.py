@@ -19,12 +19,11 @@ from ..fit.schedule import Schedule
 from ..geometry import Grid
 from ..matter import DeltaBeta, Matter
 from ..methods.surface_fit import SurfaceFit, oversampling, surface_fit
-from ..optics.noise import noise_levels
 from ..progress import Advance
 from ..representations import SurfaceMesh, isosurface
 from ..scan import Exposures, Scan
-from .beside import Beside, aligned
 from .changes import numbers_of
+from .fixed_matter import Beside, aligned
 from .newton import Step, unexplained
 from .poses import DISTANCE, FLUX, PoseOptions
 
@@ -32,17 +31,16 @@ DECAY = 0.3
 """Share of the rates that is left at the last step: distances settle slowly in noise."""
 FITTED = 0.7
 """Share of the time that the fit takes; placing frames takes the rest."""
-SHARPER = 0.7
-"""Surfaces are believed if they leave less than this part unexplained of what voxels leave, noise apart."""
+EDGES, VOXELS, SURFACES = "edges of the matter", "voxels", "surfaces"
 
 
 @dataclass(frozen=True)
 class Sharpened:
-    """step: numbers [V, 8] of all frames beside the plan, and their covariances beside the surfaces; left: [V] what
-    surfaces leave unexplained of each frame; surfaces: in the poses that were found."""
+    """step: numbers [V, 8] of all frames beside the plan, and their covariances beside the surfaces; left: [V, H, W]
+    what surfaces leave of the frames, over their contrast; surfaces: in the poses that were found."""
 
     step: Step
-    left: np.ndarray
+    left: Tensor
     surfaces: SurfaceMesh
 
 
@@ -95,14 +93,3 @@ def sharpened(scan: Scan, numbers: Tensor, start: SurfaceMesh, search: PoseOptio
 def mean_error(freedom: PoseRefinement, exposures: Exposures) -> float:
     """Standard error of the mean distance, as a share: what sampling does, or what the plan leaves open."""
     return min(mean_distance_error(exposures), freedom.distance / math.sqrt(len(freedom)))
-
-
-def believed(scan: Scan, by_surfaces: np.ndarray, by_voxels: np.ndarray) -> bool:
-    """Whether surfaces explain the training frames of `scan` so much better than voxels that its matter has edges.
-
-    by_surfaces, by_voxels: [V] rms of what they leave, as a share of each frame's contrast; noise counts for neither.
-    """
-    frames = torch.from_numpy(scan.frames)
-    noise = (noise_levels(frames) / frames.std(dim=(1, 2)).double().clamp_min(1e-12)).numpy()
-    sharp, soft = (float(np.maximum(left**2 - noise**2, 0)[~scan.is_test].sum()) for left in (by_surfaces, by_voxels))
-    return sharp < SHARPER**2 * soft

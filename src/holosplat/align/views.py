@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +11,7 @@ from torch import Tensor
 from ..baselines.primal_dual import PrimalDual
 from ..checks import require
 from ..geometry import Grid
+from ..inference import Decision, Score, select
 from ..matter import DeltaBeta, Known, MaterialPrior
 from ..methods.assumed import assumed_material
 from ..optics.background import Light, LightOptions
@@ -21,15 +21,15 @@ from ..projectors.voxels import LatticeProjector
 from ..representations import SurfaceMesh
 from ..scan import Exposures, Scan
 from .changes import changes, header, in_words, line
-from .coarse import mirrored
 from .derivatives import in_pixels, predicted
-from .directions import hardly_told
-from .few import KINDS, beside_unknown
 from .gauge import moved_onto
+from .initial_geometry import mirrored
+from .marginal_likelihood import KINDS, beside_unknown
+from .null_space import hardly_told
 from .poses import DISTANCE, FLUX, SHIFT, PoseOptions, PoseSearch
 from .rehearsal import Searched, rehearsed
 from .shadows import EVEN_OR_NOT
-from .sharp import believed, sharpened, surfaces_of
+from .sharp import EDGES, SURFACES, VOXELS, sharpened, surfaces_of
 
 DEFAULT = PoseOptions()
 SHARP = "alignment, sharp edges"
@@ -40,16 +40,11 @@ STRAY = 1.35
 """A view that leaves so many times as much unexplained as the middle one does not fit with the others."""
 FEW = 4
 """Training views below which turns across the beam pass for the depth of matter, and stay as planned."""
-ACCURACY = {"shift": 0.06, "angle": 0.12, "roll": 0.06}
-"""Rms errors of what voxels find [smallest pixels, degrees] on sharp cells whose geometry is known without errors
-(docs/data/alignment.csv): a plan that differs by less is as good, and kept."""
-SHARP_ACCURACY = {"shift": 0.01, "angle": 0.03, "roll": 0.02, "distance": 0.01}
-"""The same of what surfaces find."""
+POSES, PLANNED, ESTIMATED = "poses", "as planned", "estimated"
 UNTOLD = (
     "distances are as planned: the matter shows no sharp edges of a known density, and a longer distance sharpens "
     "fringes as such edges would"
 )
-MAY_BE_NOISE = "{kind} is as planned: what few frames say against it may be noise, or matter that they do not know"
 
 
 @dataclass(frozen=True)
@@ -63,7 +58,7 @@ class AlignedViews:
     flux: [V] of each frame, beside one
     before, after: [V] rms of what a volume leaves unexplained of each frame, as a share of its contrast, with the
         planned and with the found exposures
-    words: what was kept as planned, and why
+    words: what was kept as planned, and why; decisions: between hypotheses
     """
 
     exposures: Exposures
@@ -73,6 +68,7 @@ class AlignedViews:
     before: np.ndarray
     after: np.ndarray
     words: tuple[str, ...]
+    decisions: tuple[Decision, ...] = ()
 
     def lines(self) -> list[str]:
         """The result in words, and a table of the views."""
@@ -82,6 +78,7 @@ class AlignedViews:
             + (f", magnification {larger:.2%}, each ± {_rms(self.errors[:, 6]):.2%}" if larger > 0 else ""),
             f"unexplained share of the contrast: {_rms(self.before):.3f} as planned, {_rms(self.after):.3f} now",
             *self.words,
+            *(each.line for each in self.decisions),
             header("view", 2, "unexplained"),
             *(
                 line(v, change, error, 2, f"{self.before[v]:.3f} → {self.after[v]:.3f}")
@@ -102,7 +99,7 @@ def align_still(
 
     The volume is that of the training frames; held-out frames determine their own poses alone. A motion of
     the whole object, which no frame determines, is chosen so that the mean turn and the mean shift are those planned.
-    What differs from the plan by less than the accuracy that was measured (`ACCURACY`) stays as planned.
+    The plan is kept unless the estimated poses explain frames better (`decided_poses`): held-out ones, if any are.
 
     prior: of the material; where its δ is unknown, the occupancy has no bound. Errors: `InputError` for fewer
     than two training frames.
@@ -123,18 +120,16 @@ def align_still(
     sharp = surfaces is not None
     if options.uncertain.distance > 0 and not sharp:
         words.append(UNTOLD)
-    doubted = tuple[str, ...]()
+    wrong = None
     posed = any(getattr(options.uncertain, kind) > 0 for kind in KINDS if kind != "distance")
     if posed and count < options.few_views:
         again = lambda frames, how: searched(frames, material, how, upper, on_progress, REHEARSAL)  # noqa: E731
-        doubted = beside_unknown(search, pixels, surfaces, rehearsed(done, again))
-    words += [MAY_BE_NOISE.format(kind=kind) for kind in doubted]
+        wrong = beside_unknown(search, pixels, surfaces, rehearsed(done, again))
     errors = errors_of(search.covariances)
     errors[:, 2:4] = np.maximum(errors[:, 2:4], held)
     expected = options.uncertain.deviations()
     expected[DISTANCE] = options.uncertain.distance if sharp else 0.0
     words += hardly_told(search.covariances, expected)
-    words += _keep_planned(search, scan.exposures, pixels, sharp, doubted)
     found = search.exposures(scan.exposures)
     found = replace(found, views=moved_onto(found.views, scan.views))
     of = max(pixels, 2 if min(scan.views.shape) >= 2 * options.least_side else 1)
@@ -142,10 +137,12 @@ def align_still(
     before, after = (Judged.of(scan, exposures, search, of) for exposures in (scan.exposures, found))
     on_progress("alignment, before and after", 1.0)
     judges = scan.is_test if scan.is_test.any() else ~scan.is_test
-    telling = scan.is_test.any() or count >= options.few_views  # few frames for training agree with any poses
-    if telling and _rms(after.left[judges]) > _rms(before.left[judges]):
-        found, after = scan.exposures, before
-        words.append("all is as planned: what was found explains the frames no better")
+    decisions = [*done.decisions, *([] if wrong is None else [wrong])]
+    if scan.is_test.any() or count >= options.few_views:  # few frames for training agree with any poses
+        by = "held-out frames" if scan.is_test.any() else "training frames"
+        decisions.append(decided_poses(before.score(judges), after.score(judges), by))
+        if decisions[-1].choice == PLANNED:
+            found, after = scan.exposures, before
     words += _doubts(after)
     return AlignedViews(
         found,
@@ -155,7 +152,14 @@ def align_still(
         before.left,
         after.left,
         tuple(words),
+        tuple(decisions),
     )
+
+
+def decided_poses(planned: Score, found: Score, by: str) -> Decision:
+    """Whether poses are those planned, the null, or those that were found."""
+    scores = {PLANNED: planned, ESTIMATED: found}
+    return select(POSES, tuple(scores), lambda name, fold: scores[name], by=by)
 
 
 def searched(
@@ -168,8 +172,8 @@ def searched(
         name = f"alignment{what}, pixels of {level.pixels}"
         search.run(level, lambda fraction, name=name: on_progress(name, fraction))
     forget_distance(search)
-    surfaces = by_edges(search, levels[-1].pixels, lambda stage, part: on_progress(stage + what, part))
-    return Searched(search, levels[-1].pixels, surfaces)
+    surfaces, decisions = by_edges(search, levels[-1].pixels, lambda stage, part: on_progress(stage + what, part))
+    return Searched(search, levels[-1].pixels, surfaces, decisions)
 
 
 def errors_of(covariances: Tensor) -> np.ndarray:
@@ -184,40 +188,26 @@ def forget_distance(search: PoseSearch) -> None:
     search.covariances[:, DISTANCE] = search.covariances[:, :, DISTANCE] = 0
 
 
-def by_edges(search: PoseSearch, pixels: int, on_progress: Progress) -> SurfaceMesh | None:
+def by_edges(search: PoseSearch, pixels: int, on_progress: Progress) -> tuple[SurfaceMesh | None, tuple[Decision, ...]]:
     """Surfaces that explain the frames better than voxels of `pixels`, whose numbers those of the search become; or
-    None."""
+    None. And the decision, if surfaces were tried."""
     scan = search.scan.binned(pixels)
     options = search.options
     wanted = search.edges_follow and any(getattr(options.uncertain, kind) > 0 for kind in KINDS)
     start = surfaces_of(search.volume, scan, search.material) if wanted else None
     if start is None:
-        return None
+        return None, ()
     scales = torch.ones(search.numbers.shape[1], dtype=torch.float64)
     scales[SHIFT] = pixels
     here = replace(options, uncertain=replace(options.uncertain, shift=options.uncertain.shift / pixels))
     found = sharpened(scan, search.numbers / scales, start, here, lambda part: on_progress(SHARP, part))
-    if not believed(scan, found.left, search.unexplained(scan)):
-        return None
+    train = torch.from_numpy(~scan.is_test)
+    scores = {VOXELS: Score.of(search.residuals(scan)[train]), SURFACES: Score.of(found.left[train])}
+    decision = select(EDGES, tuple(scores), lambda name, fold: scores[name], by="training frames")
+    if decision.choice == VOXELS:
+        return None, (decision,)
     search.numbers, search.covariances = found.step.numbers * scales, found.step.covariances * scales[:, None] * scales
-    return found.surfaces
-
-
-def _keep_planned(search: PoseSearch, planned: Exposures, pixels: int, sharp: bool, others: Sequence[str]) -> list[str]:
-    """Puts kinds of numbers, beside `others`, that differ from the plan by no more than they are known back to it; says
-    which."""
-    accuracy = SHARP_ACCURACY if sharp else ACCURACY
-    found = search.exposures(planned)
-    moved = changes(replace(found, views=moved_onto(found.views, planned.views)), planned)
-    words, uncertain = [], search.options.uncertain
-    for kind, places in KINDS.items():
-        if getattr(uncertain, kind) == 0 or kind not in accuracy or kind in others:
-            continue
-        limit = accuracy[kind] * (pixels if kind == "shift" else 1)
-        if np.sqrt(np.square(moved[:, list(places)]).mean()) < limit:
-            search.numbers[:, list(places)] = 0
-            words.append(f"{kind} is as planned: the frames agree with it to within the accuracy of {limit:g}")
-    return words
+    return found.surfaces, (decision,)
 
 
 @dataclass(frozen=True)
@@ -225,11 +215,17 @@ class Judged:
     """The residual of a new volume in some exposures.
 
     left: [V] rms, as a share of each frame's contrast
-    mirrors: [V] which mirror image of a frame fits much better than itself, or ""
+    mirrors: [V] which mirror image of a frame fits better than itself, or ""
+    images: [V, H, W] the residual over each frame's contrast
     """
 
     left: np.ndarray
     mirrors: list[str]
+    images: Tensor
+
+    def score(self, which: np.ndarray) -> Score:
+        """Score the residual of the frames that `which` [V] marks."""
+        return Score.of(self.images[torch.from_numpy(which)])
 
     @classmethod
     def of(cls, scan: Scan, exposures: Exposures, search: PoseSearch, pixels: int) -> Judged:
@@ -242,8 +238,8 @@ class Judged:
         solver = PrimalDual(LatticeProjector(grid, views[train]), torch.zeros(grid.shape), options.weight, search.upper)
         solver.run(lines, 2 * options.first)
         images = predicted(solver.volume, grid, scan.exposures, search.material, fringe_sampling(scan.exposures)).frames
-        left = (frames - images).square().mean((1, 2)).sqrt() / frames.std(dim=(1, 2)).clamp_min(1e-12)
-        return cls(left.double().numpy(), mirrored(frames, images))
+        left = (frames - images) / frames.std(dim=(1, 2), keepdim=True).clamp_min(1e-12)
+        return cls(left.double().square().mean((1, 2)).sqrt().numpy(), mirrored(frames, images), left)
 
 
 def _doubts(judged: Judged) -> list[str]:

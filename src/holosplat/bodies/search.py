@@ -13,8 +13,8 @@ from ..matter import DeltaBeta
 from ..mesh import TriangleMesh
 from ..scan import Scan
 from .moments import moments, stretched_like
+from .neighbourhood_search import Heard, pursued
 from .poses import FREER, Explained, Pose
-from .replaced import Heard, pursued
 from .rest_shape import KnownBody
 from .shadows import Shadows
 

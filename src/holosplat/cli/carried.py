@@ -10,7 +10,7 @@ from ..io.reading import Reading
 from ..ranges import Weight, ranged
 
 if TYPE_CHECKING:
-    from ..motion.carried import CarriedOptions
+    from ..motion.flow_reconstruction import CarriedOptions
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class CarriedFlags:
 
     def options(self) -> CarriedOptions:
         """The options of the method."""
-        from ..motion.carried import CarriedOptions
+        from ..motion.flow_reconstruction import CarriedOptions
 
         return CarriedOptions(fading=self.fading)
 

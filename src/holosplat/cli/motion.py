@@ -13,7 +13,7 @@ from ..io.reading import Reading
 from ..io.run_scan import run_source
 from ..matter import KnownTwo, MaterialPrior, MatterKind
 from ..methods import Auto, Method
-from ..motion.carried import CarriedOptions
+from ..motion.flow_reconstruction import CarriedOptions
 from ..optics.background import LightOptions
 from ..planning.acts import of_motion
 from ..report.run import report_run
@@ -80,7 +80,7 @@ def reconstruct_in_motion(
     for line in (*evaluation.lines(), *(result.verdict.lines("training frames") if result.verdict else ())):
         print(line)
     seconds = sum(result.timing.values())
-    for line in found.history:
+    for line in (*found.history, *(each.line for each in result.choice.decisions)):
         print(line, file=sys.stderr)
     print(f"{seconds:.1f} s, {result.object.described}; report: {report}", file=sys.stderr)
     return True

@@ -90,6 +90,16 @@ class FlowProblem:
         """½ χ² of every time."""
         return [s.frames(s.lines(self.at(u, k).detach())).value for k, s in enumerate(self._still)]
 
+    @torch.no_grad()
+    def residuals(self, u: Tensor) -> Tensor:
+        """[F, H, W] of the amplitudes of all frames, over their noise: white where nothing is left unexplained."""
+        left = list[Tensor]()
+        for k, still in enumerate(self._still):
+            frames = still.frames
+            missing = torch.fft.rfft2(frames.amplitudes(still.lines(self.at(u, k))) - frames.measured)
+            left.append(torch.fft.irfft2(missing / frames.power.sqrt(), s=frames.shape))
+        return torch.cat(left)
+
     def flow_misfit(self, u: Tensor, flow: Flow) -> float:
         """½ χ² of `u` carried by `flow`; its gradient is added to those of the flow's parameters, time by time."""
         value = 0.0

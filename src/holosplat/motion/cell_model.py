@@ -18,8 +18,8 @@ from ..specimens.flow.suspension import Medium
 from ..specimens.membrane.model import Elasticity, Membrane
 from ..specimens.membrane.resting import resting_cell
 from .cell_flow import CellFlow, Unknowns, Velocity, advanced
-from .dressing import Bound, dressed, scaled
 from .forecast import areas, normals
+from .membrane_fit import Bound, dressed, scaled
 
 ENDLESS = 1e-3
 """Length of the channel [m]: no field holds cells that feel each other around it."""

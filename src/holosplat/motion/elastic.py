@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -96,3 +97,30 @@ class RestShapeKept:
         paths = model.parameters()[COEFFICIENTS]
         nodes = torch.einsum("tk,kpx->tpx", self._weights, paths).unflatten(1, (self._count, -1))
         return [LossPart("rest_shape", self._weight, self._elastic(nodes).mean(0).sum())]
+
+
+RED_CELL = Elasticity(global_area=0.0, volume=0.0)
+"""Shear, dilation and bending of a red cell's membrane (docs/cells.md): what is stored in it, without what keeps its
+area and volume in a simulation."""
+
+
+def strain_energy(
+    bodies: MovingSurfaces, times: np.ndarray, rest: TriangleMesh, elasticity: Elasticity = RED_CELL
+) -> np.ndarray:
+    """[T, B] J of each body at `times` [s]: 0 in the shape of `rest` [m], in any pose.
+
+    Energies compare triangles with themselves, so that all bodies must have the triangles of `rest`, in its order;
+    motion along a surface, which frames do not see, counts as strain. Errors: `InputError` for other triangles.
+    """
+    parts = [bodies.body(k) for k in range(bodies.count)]
+    wanted = torch.tensor(rest.faces)
+    require(
+        all(torch.equal(faces, wanted) for _, faces in parts),
+        f"strain energy needs bodies of the triangles of the shape at rest, {len(rest.faces)} each, but these have "
+        "others; follow bodies of a known shape.",
+    )
+    membrane, found = Membrane(rest, elasticity), []
+    for time in times:
+        nodes = np.stack([mesh.vertices for mesh in bodies.bodies(float(time))])
+        found.append(membrane.energy(torch.from_numpy(nodes)).numpy())
+    return np.array(found)

@@ -26,10 +26,9 @@ from ..ranges import Rate, Weight, ranged
 from ..representations import MovingSurfaces
 from ..representations.isosurface import adjacency
 from ..scan import Scan
-from .carrier import Carried
-from .contact import Apart
 from .elastic import Rest, RestShapeKept
-from .terms import COEFFICIENTS, Acceleration, MovingBending, area_kept, volume_kept
+from .terms import COEFFICIENTS, Acceleration, Apart, MovingBending, area_kept, volume_kept
+from .velocity_prior import Carried
 
 OPEN = 1e-3
 """Share of the times' mean square below which a coefficient is taken to be seen so well: what frames hardly see of a

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import torch
 
 from ..mesh import TriangleMesh
-from .sightings import Sighting
+from .detections import Detection
 
 
 class Journal(Protocol):
@@ -33,7 +33,7 @@ class Nowhere:
         """Forget it."""
 
 
-def from_sightings(found: Sequence[Sequence[Sighting]]) -> list[list[dict[str, Any]]]:
+def from_sightings(found: Sequence[Sequence[Detection]]) -> list[list[dict[str, Any]]]:
     """Sightings at each time as tensors and plain values, which `to_sightings` reads."""
     return [
         [
@@ -49,11 +49,11 @@ def from_sightings(found: Sequence[Sequence[Sighting]]) -> list[list[dict[str, A
     ]
 
 
-def to_sightings(saved: Sequence[Sequence[Mapping[str, Any]]]) -> list[list[Sighting]]:
+def to_sightings(saved: Sequence[Sequence[Mapping[str, Any]]]) -> list[list[Detection]]:
     """The inverse of `from_sightings`."""
     return [
         [
-            Sighting(TriangleMesh(one["vertices"].numpy(), one["faces"].numpy(), one["name"]), bool(one["cut"]))
+            Detection(TriangleMesh(one["vertices"].numpy(), one["faces"].numpy(), one["name"]), bool(one["cut"]))
             for one in bodies
         ]
         for bodies in saved

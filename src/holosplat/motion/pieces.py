@@ -1,4 +1,4 @@
-"""How many pieces paths have: as many as predict frames that a short fit has not seen."""
+"""The number of pieces of paths: as many as predict frames that a short fit has not seen."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import torch
 from ..checks import at_least, in_range
 from ..fit.residuals import Prediction
 from ..fit.running import Steps
+from ..inference import Compared, Decision, Score
 from ..optics.background import Light
 from ..ranges import ranged
 from ..representations import MovingSurfaces
@@ -17,8 +18,7 @@ from ..scan import Scan
 from .elastic import Rest
 from .fit import MotionFit, motion_fit
 
-SURE = 2.0
-"""Standard errors by which more pieces must be better."""
+NAME, BY = "pieces of paths", "frames set aside"
 
 
 @dataclass(frozen=True)
@@ -51,19 +51,20 @@ def chosen_paths(
     rest: Rest | None = None,
     *,
     steps: Steps | None = None,
-) -> MovingSurfaces:
-    """`start` on paths of the asked number of pieces, or of the number that predicts held-out frames best.
+) -> tuple[MovingSurfaces, Decision | None]:
+    """`start` on paths of the asked number of pieces, or of the number that predicts held-out frames best; and the
+    decision, None where there was none.
 
-    Numbers are doubled as long as a fit goes on better so than with as many pieces as before: half the steps of `how`,
-    on all but the held-out frames, which it then predicts better by more than chance. There are never more coefficients
-    than times. steps: in which it is done, one for each fit.
+    The number is doubled as long as a fit predicts the held-out frames better with it than with the number before
+    (`inference.Compared`). A fit has half the steps of `how`. There are never more coefficients than times. steps: in
+    which it is done, one for each fit.
     """
     if options.pieces > 0:
-        return refined(start, options.pieces)
+        return refined(start, options.pieces), None
     most = min(options.most_pieces, len(train.instants) - options.degree)
     candidates = [n for n in (2**k for k in range(8)) if n <= most]
     if len(candidates) < 2 or len(train) < 2 * options.held_out:
-        return start
+        return start, None
     aside = np.zeros(len(train), dtype=bool)
     aside[np.random.default_rng(seed).permutation(len(train))[: len(train) // options.held_out]] = True
     short = replace(how, schedule=replace(how.schedule, steps=max(1, how.schedule.steps // 2)))
@@ -76,19 +77,20 @@ def chosen_paths(
         fit.run(lambda record: None)
         found = fit.result().object
         assert isinstance(found, MovingSurfaces)
-        return found.coefficients.detach(), _errors(left, found, fit.oversample)
+        return found.coefficients.detach(), _left(left, found, fit.oversample)
 
-    def fitted(bodies: MovingSurfaces) -> tuple[MovingSurfaces, np.ndarray]:
-        coefficients, errors = steps.of(lambda: run(bodies))
-        return bodies.with_parameters({"coefficients": coefficients}), errors.numpy()
+    def fitted(bodies: MovingSurfaces) -> tuple[MovingSurfaces, Score]:
+        coefficients, left = steps.of(lambda: run(bodies))
+        return bodies.with_parameters({"coefficients": coefficients}), Score(left.numpy(), len(left))
 
-    best, begun = start.basis.pieces, fitted(start)[0]
+    best, begun, compared = start.basis.pieces, fitted(start)[0], list[Compared]()
     for pieces in candidates[1:]:
         same, finer = fitted(begun), fitted(refined(begun, pieces))
-        if not _better(same[1], finer[1]):
+        compared.append(Compared(str(pieces), *finer[1].gain_over(same[1])))
+        if not compared[-1].wins:
             break
         best, begun = pieces, finer[0]
-    return refined(start, best)
+    return refined(start, best), Decision(NAME, str(best), BY, tuple(compared))
 
 
 def refined(start: MovingSurfaces, pieces: int) -> MovingSurfaces:
@@ -103,17 +105,12 @@ def refined(start: MovingSurfaces, pieces: int) -> MovingSurfaces:
     return MovingSurfaces(paths, start.faces, start.of_body, basis, start.unit_length, start.matter, start.lines)
 
 
-def _errors(held_out: Scan, found: MovingSurfaces, oversample: int) -> torch.Tensor:
-    """Mean square residual [V] of each held-out frame."""
+def _left(held_out: Scan, found: MovingSurfaces, oversample: int) -> torch.Tensor:
+    """Powers [V, K] of `Score` of the held-out frames, one block a frame: frames differ by more than their parts do."""
     said, measured = Prediction(found, held_out.exposures, oversample), torch.from_numpy(held_out.frames)
     with torch.no_grad():
-        left = [float((said.view(v).frames()[0] - one).square().mean()) for v, one in enumerate(measured)]
-        return torch.tensor(left, dtype=torch.float64)
-
-
-def _better(before: np.ndarray, after: np.ndarray) -> bool:
-    gain = before - after
-    return bool(gain.mean() > SURE * gain.std(ddof=1) / np.sqrt(len(gain)))
+        left = torch.stack([said.view(v).frames()[0] - one for v, one in enumerate(measured)])
+    return torch.from_numpy(Score.of(left).powers).unflatten(0, (len(left), -1)).mean(dim=1)
 
 
 def _part(light: Light | None, kept: np.ndarray) -> Light | None:

@@ -7,15 +7,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
+from ..fit.flow_volume import FlowProblem
+from ..fit.smooth_volume import Descent
 from ..fit.whitened import WhitenedFrames
+from ..inference import Compared
 from ..matter import DeltaBeta
 from ..methods import Task
 from ..optics.noise_model import NoiseModel
 from ..scan import Scan
-
-ORDERS = 200
-"""Orders of the times that are tried for one without a trend."""
 
 
 @dataclass(frozen=True)
@@ -63,8 +64,49 @@ def merged(scan: Scan) -> Scan:
     return replace(scan[each[0]], frames=frames).as_static()
 
 
-def trendless(count: int) -> list[int]:
-    """Numbers below `count` in the order, of some hundred random ones, that goes least with them."""
-    rng, numbers = np.random.default_rng(0), np.arange(count) - 0.5 * (count - 1)
-    orders = [rng.permutation(count) for _ in range(ORDERS)]
-    return min(orders, key=lambda order: abs(float(numbers @ order))).tolist()
+WINDOW, PATIENCE = 10, 3
+"""Iterations from one look at held-out frames to the next, and looks without a better one after which the fit ends."""
+
+
+def kept_frames(times: int, views: int, held_out: int, seed: int, fold: int = 0) -> np.ndarray:
+    """[T, V] bool: all frames but one in `held_out`, drawn at random, others in each `fold`; one a time at least."""
+    aside, count = np.zeros(times * views, dtype=bool), times * views // held_out
+    aside[np.random.default_rng(seed).permutation(times * views)[fold * count : (fold + 1) * count]] = True
+    keep = ~aside.reshape(times, views)
+    keep[~keep.any(1), 0] = True
+    return keep
+
+
+def iterations_that_predict(kept: FlowProblem, aside: FlowProblem, u: Tensor, most: int) -> tuple[int, float]:
+    """How many iterations from `u` [Z, Y, X] on, fitted to the frames `kept`, predict those `aside` best; and what that
+    takes from ½ χ² of these, beside the first look.
+
+    A volume that follows noise predicts other frames worse, so the end of the fit is where the data put it (early
+    stopping; Prechelt 1998), and not where the objective has its minimum. `most`: of them, at most.
+    """
+    descent, first = Descent(kept, u), min(WINDOW, most)
+    best, least, begun = 0, np.inf, np.inf
+    while descent.done < most and not descent.ended:
+        descent.step()
+        if descent.done % WINDOW and descent.done < most and not descent.ended:
+            continue
+        missed = sum(aside.misfit(descent.u))
+        begun = missed if descent.done <= first else begun
+        if missed < least:
+            best, least = descent.done, missed
+        elif descent.done >= best + PATIENCE * WINDOW:
+            break
+    return max(best, 1), float(begun - least) if best else 0.0
+
+
+def likelihood_ratio(name: str, null: Tensor, other: Tensor) -> Compared:
+    """The candidate `name`, which leaves `other` [F, H, W] of frames in units of their noise, beside the null.
+
+    With known noise, the logarithm of the likelihood ratio `½ Σ (n² - o²)` has the standard deviation `√Σ (n - o)²`
+    (Cox 1961, Proc. 4th Berkeley Symp. 1, 105). Noise counts as large as what is left, if that is more. Both are given
+    per `Σ o²`: the gain is then the logarithm of the ratio of residuals, where these are nearly alike.
+    """
+    n, o = (images.double() for images in (null, other))
+    left = float(o.square().sum())
+    noise = max(1.0, left / o.numel()) ** 0.5
+    return Compared(name, 0.5 * float((n.square().sum()).log() - np.log(left)), noise * float((n - o).norm()) / left)

@@ -10,9 +10,9 @@ from ..matter import DeltaBeta
 from ..optics.background import Light
 from ..progress import FitProgress
 from ..scan import Scan
-from .contest import Parts, cells_or_any
-from .following import Followed, Following, require_times
+from .body_tracker import BodyTracker, Followed, require_times
 from .journal import Journal, Nowhere
+from .model_comparison import Parts, compared_kinds
 from .track_options import TrackOptions
 
 __all__ = ["NOWHERE", "USUAL", "Followed", "TrackOptions", "follow", "require_times"]
@@ -39,15 +39,15 @@ def follow(
     light: of the training frames, which were divided by it, where it is uneven. journal: keeps every stage that is
     done, and fits from time to time; what it holds already is not done again, and the result is the same bit for bit.
     Where all frames are of two beams, of unknown shape, and a network of red cells guesses the bodies, they are
-    followed as red cells, too; these are kept unless bodies of any shape leave clearly less (`contest`). Errors:
+    followed as red cells, too; these are kept unless bodies of any shape leave less (`model_comparison`). Errors:
     `InputError` for a scan of one time, and where no body is seen.
     """
     train = scan.train()
     require_times(train)
     parts = Parts(journal)
 
-    def following(name: str, body: KnownBody | None) -> Following:
-        run = Following(train, material, replace(options, body=body), seed, light, parts.of(name), on_progress)
+    def following(name: str, body: KnownBody | None) -> BodyTracker:
+        run = BodyTracker(train, material, replace(options, body=body), seed, light, parts.of(name), on_progress)
         run.take_up()
         return run
 
@@ -55,6 +55,6 @@ def follow(
     if options.body is None and options.cells and two_beams(train.views) is not None:
         run.until("first paths")
         if run.cells > 0:
-            return cells_or_any(following("cells", guessed_cells(run.cells)), run)
+            return compared_kinds(following("cells", guessed_cells(run.cells)), run)
     run.until("done")
     return run.followed()

@@ -9,10 +9,10 @@ from ..bodies.rest_shape import KnownBody
 from ..fit.schedule import Schedule
 from ..learning.start import LearnedStart
 from ..ranges import Share, ranged
+from .detections import SightingOptions
 from .fit import MotionFit, converged
-from .identities import LinkOptions
 from .pieces import PathOptions
-from .sightings import SightingOptions
+from .track_linking import LinkOptions
 
 
 def _stiff() -> MotionFit:

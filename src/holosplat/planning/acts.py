@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ..matter import MatterKind
     from ..methods import Method, Pinn
     from ..methods.surface_fit import SurfaceOptions
-    from ..motion.carried import CarriedOptions
+    from ..motion.flow_reconstruction import CarriedOptions
     from ..motion.track_options import TrackOptions
     from ..scan import Exposures
 

@@ -16,11 +16,11 @@ from ..io.nxtomo import write_scan
 from ..io.objects import write_object
 from ..methods.presets import SCHEMA
 from ..metrics import image_scores, intensity_range
-from ..motion.by_frames import carry_by_frames
+from ..motion.assimilate import carry_by_frames
 from ..motion.dynamics import DynamicsForecast, carry, window_of
 from ..motion.fit import MotionFit
 from ..motion.forecast import Forecast, Halves, PathForecast, extrapolate
-from ..motion.half_sets import LEAST, half_sets
+from ..motion.split_half_errors import LEAST, half_sets
 from ..optics.background import Light
 from ..progress import FitProgress
 from ..ranges import Many, Seconds, ranged

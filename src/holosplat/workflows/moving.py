@@ -10,7 +10,7 @@ from ..matter import KnownTwo, MaterialPrior
 from ..methods import Task
 from ..methods.assumed import assumed_material
 from ..methods.illumination import prepared
-from ..motion.carried import NOWHERE, CarriedOptions, Search, merged
+from ..motion.flow_reconstruction import NOWHERE, CarriedOptions, Search, merged
 from ..optics.background import LightOptions
 from ..optics.sampling import fringe_sampling
 from ..progress import FitProgress
@@ -87,6 +87,7 @@ def reconstruct_moving(
     found = search.run()
     oversample = fringe_sampling(train.exposures)
     said = Prediction(found.object, task.scan.exposures, oversample)
+    decisions = (*task.decisions, *found.decisions)
     done = Reconstruction(
         found.object,
         KIND,
@@ -94,7 +95,7 @@ def reconstruct_moving(
         oversample,
         found.timing,
         True,
-        Choice("continuous", {}, "Gaussians", decisions=task.decisions, against=task.prior.against),
+        Choice("continuous", {}, "Gaussians", decisions=decisions, against=task.prior.against),
         task.delta_told,
         judge(said, task.scan, task.noise if task.uneven else None),
         light=light_options_of(task),

@@ -18,10 +18,9 @@ from ..matter import KnownTwo, MaterialPrior
 from ..methods import Task
 from ..methods.assumed import assumed_material
 from ..methods.illumination import prepared
-from ..motion.elastic import Rest
-from ..motion.halves import standard_errors
+from ..motion.elastic import Rest, strain_energy
 from ..motion.measures import columns, measured, row
-from ..motion.strain import strain_energy
+from ..motion.split_half_errors import standard_errors
 from ..motion.track import NOWHERE, USUAL, Followed, TrackOptions, follow, require_times
 from ..optics.background import LightOptions
 from ..progress import FitProgress
@@ -109,7 +108,7 @@ def track(
             found.oversample,
             found.timing,
             True,
-            Choice("levels", {}, "soft fit", found.begun, task.decisions),
+            Choice("levels", {}, "soft fit", found.begun, (*task.decisions, *found.decisions)),
             task.delta_told,
             judge(said, train, task.noise if task.uneven else None),
             light=light_options_of(task),

@@ -10,9 +10,9 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from holosplat.align.coarse import shifts_by_mass
 from holosplat.align.derivatives import in_pixels, projections
 from holosplat.align.find import align_views
+from holosplat.align.initial_geometry import shifts_by_mass
 from holosplat.align.newton import blurred
 from holosplat.baselines import TOMOGRAPHIES
 from holosplat.geometry import Grid, Views

@@ -1,10 +1,11 @@
-"""Bodies as single times show them: a volume of each time by itself, cut into closed surfaces."""
+"""Bodies at single times: a volume of each time, by tomography or by a network, cut into closed surfaces."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from ..baselines import HolographicTV, holographic_tv
@@ -12,17 +13,19 @@ from ..bodies.cut import EDGE, LEAST_VOLUME, LEVEL, SMOOTHING, cut_bodies, is_cu
 from ..bodies.moments import centroid
 from ..checks import in_range
 from ..geometry import Grid
+from ..inference import Decision, Score, select
 from ..learning.network import Guess
-from ..learning.start import guess_matter
-from ..matter import DeltaBeta
+from ..learning.start import Guessed, LearnedStart, guess_matter, missing_thickness
+from ..matter import DeltaBeta, Matter
 from ..mesh import TriangleMesh
 from ..progress import Progress
 from ..ranges import Pixels, Weight, ranged
+from ..representations import VoxelGrid
 from ..scan import Scan
 
 
 @dataclass(frozen=True)
-class Sighting:
+class Detection:
     """A body at one time. mesh: its surface [m]; cut: whether it goes on beyond the field, so that a part is seen."""
 
     mesh: TriangleMesh
@@ -70,7 +73,7 @@ def sightings(
     options: SightingOptions = SightingOptions(),
     on_progress: Progress = lambda stage, part: None,
     network: Guess | None = None,
-) -> list[Sighting]:
+) -> list[Detection]:
     """The bodies of `material` in the frames of `scan`, of one time, the largest first; none where nothing is seen.
 
     network: guesses the volume, which is made by total variation without one.
@@ -78,7 +81,7 @@ def sightings(
     values, grid = occupancy(scan, material, options, on_progress, network)
     how = options.level, options.least_volume, options.smoothing
     bodies = cut_bodies(values.numpy(), grid, scan.views.finest, *how)
-    return [Sighting(body, is_cut(body, scan.views, options.edge)) for body in bodies]
+    return [Detection(body, is_cut(body, scan.views, options.edge)) for body in bodies]
 
 
 def occupancy(
@@ -89,3 +92,33 @@ def occupancy(
         return holographic_tv(scan, material, options.volume, on_progress)
     found = guess_matter(scan, material, network, on_progress)
     return found.values, found.grid
+
+
+NAME = "bodies at single times"
+TOMOGRAPHY, NETWORK = "tomography", "network's guess"
+
+
+def network_for(
+    scan: Scan, material: DeltaBeta, options: SightingOptions, how: LearnedStart, on_progress: Progress
+) -> tuple[Guess | None, Decision]:
+    """The network whose guesses show the bodies of `material` in the frames of one time, `scan`, better; or None.
+
+    Both volumes are cut at the bodies' level, for bodies are full, and their shadows compared with retrieved thickness.
+    Tomography, the null, was fitted to these frames, and the guess was not.
+    """
+    trained = how.network
+    found = guess_matter(scan, material, trained.network, on_progress)
+    values, grid = occupancy(scan, material, options, on_progress, None)
+    seen = VoxelGrid(values[None], grid, Matter.one(*material)).resampled(found.grid).values[0]
+    scores = {TOMOGRAPHY: missed_by_bodies(seen, found, options.level)}
+    scores[NETWORK] = missed_by_bodies(found.values, found, options.level)
+    decision = select(NAME, tuple(scores), lambda name, fold: scores[name], by="frames of one time")
+    return (trained.network if decision.choice == NETWORK else None), decision
+
+
+def missed_by_bodies(values: Tensor, found: Guessed, level: float) -> Score:
+    """Relative residual of the thickness that the network saw, with full bodies.
+
+    values: [Z, Y, X] on the voxels of `found`, of which what is above `level` is full
+    """
+    return Score.of(missing_thickness((values > level).to(torch.float32), found.images, found.taps)[0])

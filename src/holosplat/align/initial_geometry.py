@@ -1,4 +1,4 @@
-"""Initial geometry from retrieved thickness: reversed beams, and their parameters by rows."""
+"""Initial geometry from retrieved thickness: centres of mass, mirrored beams, and parameters by rows."""
 
 from __future__ import annotations
 
@@ -7,20 +7,57 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from ..geometry import Views
+from ..inference import Compared, Decision, Score, select
 from ..matter import DeltaBeta
 from ..optics.retrieval import Tikhonov, tikhonov
 from ..scan import Scan
-from .coarse import SIDES
 from .derivatives import in_pixels
+from .null_space import Told
 from .row_sums import FACTOR, RowEstimate, RowPrior, by_rows, plane_angles
-from .untold import Told
 
-REVERSED = 0.5
-"""A beam counts as reversed if the disagreement of its rows then falls below this part."""
-SMALL = 0.03
-"""Disagreement of rows, as a share of their moments, below which nothing is looked for that is reversed."""
+BY = "the same rows"
+SIDES = {"x": (-1,), "y": (-2,), "xy": (-1, -2)}
+"""Names of mirror images, and the axes that are reversed."""
+
+
+def shifts_by_mass(thickness: np.ndarray, views: Views) -> np.ndarray:
+    """Detector shifts [V, 2] [pixels] beside those of `views` that bring all centres of mass to one point of space.
+
+    thickness: [V, H, W] ≥ 0 of matter that lies in the field of every view. The centre of mass of a projection is the
+    projection of the centre of mass (the moment of order one, Helgason 1980); the point is that which asks for the
+    least shifts.
+    """
+    edges = views.relative[:, None]
+    seen = centres_of_mass(thickness) + views.shifts / views.pixel_sizes[:, None]
+    design = views.rotations[:, :2].reshape(-1, 3)
+    point = np.linalg.lstsq(design, (seen * edges).reshape(-1), rcond=1e-9)[0]
+    return (design @ point).reshape(-1, 2) / edges - seen
+
+
+def centres_of_mass(images: np.ndarray) -> np.ndarray:
+    """Centres of mass [V, 2] (x, y) [pixels] of images [V, H, W], from the middle of the image."""
+    h, w = images.shape[1:]
+    at_x, at_y = images.sum(1) @ (np.arange(w) + 0.5 - w / 2), images.sum(2) @ (np.arange(h) + 0.5 - h / 2)
+    return np.stack([at_x, at_y], axis=1) / images.sum((1, 2))[:, None]
+
+
+def mirrored(frames: Tensor, predicted: Tensor) -> list[str]:
+    """Compare frames [V, H, W] with those of a volume [V, H, W]: "" or the mirror image that fits, for each.
+
+    One of "x" (columns are reversed), "y" (rows are), "xy".
+    """
+    images = {"": frames, **{side: frames.flip(axes) for side, axes in SIDES.items()}}
+    found = list[str]()
+    for v in range(len(frames)):
+        scores = {side: Score.of(image[[v]] - predicted[[v]]) for side, image in images.items()}
+        found.append(select("mirrored", tuple(scores), lambda side, fold, of=scores: of[side], by="a frame").choice)
+    return found
+
+
+REVERSED, NONE = "reversed beams", "none"
 EDGE, PASSING = 1 / 16, 0.25
 """Share of the columns on either side of a frame that are its edge; matter passes it where thickness there is more than
 this part of the mean (0.03 to 0.1 with the retrieval's errors alone, 0.4 and more with cells that pass)."""
@@ -32,7 +69,7 @@ ANGLE = 3
 
 
 @dataclass(frozen=True)
-class Begun:
+class RowGeometry:
     """Estimates of V views from rows, lengths in pixels of the images.
 
     numbers, rates: [V, 5] shifts and turns [rad] at the middle of the times, and how much more at their end
@@ -40,7 +77,7 @@ class Begun:
     before, after: [V] rms of what rows have against being of one object, as a share of their moments
     sides: [V] which mirror image each frame is, or ""
     believed: whether matter lies in the field of every view, else rows need not agree
-    words: what they cannot tell
+    words: what they cannot tell; left: of all rows, before and after; decision: on reversed beams
     """
 
     numbers: np.ndarray
@@ -52,6 +89,8 @@ class Begun:
     sides: tuple[str, ...]
     believed: bool
     words: tuple[str, ...]
+    left: tuple[Score, Score]
+    decision: Decision
 
 
 @dataclass(frozen=True)
@@ -89,7 +128,7 @@ class Images:
         return by_rows(self.values[:, index], self.views[index], prior, self.when)
 
 
-def begun(images: Images, expected: np.ndarray, drifts: np.ndarray, few: bool) -> Begun | None:
+def geometry_from_rows(images: Images, expected: np.ndarray, drifts: np.ndarray, few: bool) -> RowGeometry | None:
     """Estimate poses from rows; None for beams that do not lie in one plane.
 
     expected: [5] standard deviations of shifts [pixels of the images] and turns [rad]; drifts: [5], as in `RowPrior`;
@@ -100,7 +139,9 @@ def begun(images: Images, expected: np.ndarray, drifts: np.ndarray, few: bool) -
     train, everything = np.flatnonzero(~images.is_test), np.arange(len(images.views))
     planned = images.estimate(RowPrior.of(np.zeros_like(expected), len(everything)), everything)
     held = expected * (np.arange(len(expected)) != ANGLE) if few else expected
-    images, sides, first = _upright(images, train, RowPrior.of(held, len(train)))
+    images, sides, first, compared = _upright(images, train, RowPrior.of(held, len(train)))
+    turned = ", ".join(f"beam {v} along {side}" for v, side in enumerate(sides) if side)
+    decision = Decision(REVERSED, turned or NONE, BY, compared)
     told, free = Told.of(first.information, images.views[train], expected), held
     if few and len(told.ratios) and told.ratios[0] >= FIRMLY:
         free = expected
@@ -114,7 +155,7 @@ def begun(images: Images, expected: np.ndarray, drifts: np.ndarray, few: bool) -
     errors[train] = told.errors
     rate_errors[train] = Told.of(found.rate_information, images.views[train], prior.drifts).errors
     errors[:, free == 0] = expected[free == 0]
-    return Begun(
+    return RowGeometry(
         whole.numbers[:, : len(free)],
         whole.rates[:, : len(free)],
         errors,
@@ -124,6 +165,8 @@ def begun(images: Images, expected: np.ndarray, drifts: np.ndarray, few: bool) -
         tuple(sides),
         not images.passing(),
         tuple(told.words(FIRMLY if few else 0.0)) if few else (),
+        (planned.left, whole.left),
+        decision,
     )
 
 
@@ -140,8 +183,10 @@ def _errors(found: RowEstimate) -> np.ndarray:
     return np.sqrt(np.maximum(variances, 0))
 
 
-def _upright(images: Images, train: np.ndarray, prior: RowPrior) -> tuple[Images, list[str], RowEstimate]:
-    """The images with reversed views turned back, which these are, and the estimate by training views.
+def _upright(
+    images: Images, train: np.ndarray, prior: RowPrior
+) -> tuple[Images, list[str], RowEstimate, tuple[Compared, ...]]:
+    """The images with reversed views turned back, which these are, the estimate by training views, and comparisons.
 
     One view after another is reversed, that which makes rows agree best; the later one of two that are as good. Masses
     of rows tell which are upside down. Columns that are reversed turn the signs of first moments; with two views, any
@@ -149,15 +194,14 @@ def _upright(images: Images, train: np.ndarray, prior: RowPrior) -> tuple[Images
     """
     sides, found = [""] * len(images.views), images.estimate(prior, train)
     kinds = tuple(SIDES) if len(train) > 2 else ("y",)
+    compared = list[Compared]()
     for _ in range(0 if images.passing() else len(train) // 2):
-        left = float(np.sqrt(np.mean(found.after**2)))
-        if left < SMALL:
-            break
         tried = {(v, side): images.reversed(v, side) for v in train[::-1] if not sides[v] for side in kinds}
         estimates = {key: each.estimate(prior, train) for key, each in tried.items()}
-        worst = {key: float(np.sqrt(np.mean(each.after**2))) for key, each in estimates.items()}
-        best = min(worst, key=lambda key: round(worst[key] / left, 3))
-        if worst[best] > REVERSED * left:
+        gains = {key: each.left.gain_over(found.left) for key, each in estimates.items()}
+        best = max(gains, key=lambda key: round(gains[key][0], 3))
+        compared.append(Compared(f"beam {best[0]} along {best[1]}", *gains[best]))
+        if not compared[-1].wins:
             break
         sides[best[0]], images, found = best[1], tried[best], estimates[best]
-    return images, sides, found
+    return images, sides, found, tuple(compared)

@@ -1,6 +1,8 @@
-"""Poses of few views, estimated with the matter as a nuisance."""
+"""Poses of few views, with the matter integrated out: how far frames determine them, and shrinkage to the plan."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -8,15 +10,97 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from ..geometry import Grid, Views
+from ..inference import Decision
 from ..optics.sampling import fringe_sampling
 from ..representations import SurfaceMesh
-from .beside import BLUR
 from .derivatives import in_pixels, predicted
-from .evidence import weighed
+from .fixed_matter import BLUR
 from .following import SHARP, SOFT, of_poses
 from .newton import blurred
+from .null_space import beside, motions, null
 from .poses import DISTANCE, FLUX, MAGNIFICATION, PoseSearch
-from .untold import motions, null
+
+NAME, NONE = "errors of the plan", "none"
+STRONG = 3.0
+"""Logarithm of the ratio of evidences from which a plan counts as wrong: 20 to 1, strong (Kass & Raftery 1995)."""
+SCALES = (0.0, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
+"""Sizes of the plan's errors, as shares of what is uncertain, that are tried."""
+SWEEPS = 3
+"""Times that the size of each kind's errors is chosen beside those of the others."""
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """Estimates of K parameters of each of V views.
+
+    numbers: [V, K] as far as the frames determine them
+    covariance: [V · K, V · K] of what was found, with what is uncertain as the prior
+    off: [V · K, V · K] mean squares and products of what `numbers` are off by: the covariance, and how far they are
+        from the likeliest with this prior, for what stays as planned may be as wrong as the estimates indicate
+    scales: of each kind of numbers, the likeliest size of the plan's errors as a share of what is uncertain, 0 for none
+    """
+
+    numbers: np.ndarray
+    covariance: np.ndarray
+    off: np.ndarray
+    scales: tuple[float, ...]
+
+
+def weighed(
+    found: np.ndarray,
+    information: np.ndarray,
+    expected: np.ndarray,
+    kinds: list[list[int]],
+    motions: np.ndarray,
+) -> Weighed:
+    """The likeliest parameters of V views, with errors of the plan of the size of largest evidence.
+
+    found: [V, K]; information: [V · K, V · K] of them, beside matter that is not known; expected: [K] their standard
+    deviations; kinds: the places of those that are wrong by the same share of these; motions: [V · K, M] what common
+    motions do to all, which no frame determines and which are left out.
+
+    With found numbers normal about the true ones, and these about the plan, the evidence of a size of the plan's errors
+    has a closed form (MacKay 1992). The largest is taken; for each kind with errors it must be larger by `STRONG`. Each
+    combination of parameters then shrinks to the plan as far as the frames do not determine it.
+    """
+    units = np.tile(expected, len(found))
+    kept = beside(motions / units[:, None])
+    scaled = _project_out(units[:, None] * information * units, motions / units[:, None])
+    told, values = kept.T @ scaled @ kept, kept.T @ (found.reshape(-1) / units)
+    shares = np.zeros((len(kinds), found.size))
+    for row, places in zip(shares.reshape(len(kinds), *found.shape), kinds):
+        row[:, places] = 1
+
+    def spread_of(scales: tuple[float, ...]) -> np.ndarray:
+        return (kept.T * (np.square(scales) @ shares)) @ kept
+
+    def gain(scales: tuple[float, ...]) -> float:
+        return _evidence(told, values, spread_of(scales)) - STRONG * np.count_nonzero(scales)
+
+    scales = (1.0,) * len(kinds)
+    for k in list(range(len(kinds))) * SWEEPS:
+        scales = max((scales[:k] + (tried,) + scales[k + 1 :] for tried in SCALES), key=gain)
+    spread = spread_of(scales)
+    shrunk = spread @ np.linalg.solve(told @ spread + np.eye(len(told)), told @ values)
+    whole = np.linalg.inv(told + np.eye(len(told)))
+    away = whole @ told @ values - shrunk
+    covariance, off = (
+        units[:, None] * (kept @ part @ kept.T) * units for part in (whole, whole + np.outer(away, away))
+    )
+    return Weighed((units * (kept @ shrunk)).reshape(found.shape), covariance, off, scales)
+
+
+def _evidence(told: np.ndarray, values: np.ndarray, spread: np.ndarray) -> float:
+    """Log density, up to a constant, of `values`, whose errors have the information `told`, about 0 ± `spread`."""
+    both = told @ spread + np.eye(len(told))
+    return float(-0.5 * np.linalg.slogdet(both)[1] - 0.5 * values @ np.linalg.solve(both, told @ values))
+
+
+def _project_out(information: np.ndarray, motions: np.ndarray) -> np.ndarray:
+    """Information of what is left when the best of all `motions` is taken out."""
+    across = information @ motions
+    return information - across @ np.linalg.pinv(motions.T @ across, rcond=1e-9, hermitian=True) @ across.T
+
 
 KINDS = {"shift": (0, 1), "angle": (2, 3), "roll": (4,), "distance": (DISTANCE,), "magnification": (MAGNIFICATION,)}
 """Places of the numbers of each kind."""
@@ -28,11 +112,11 @@ SIDE = 64
 
 def beside_unknown(
     search: PoseSearch, pixels: int, surfaces: SurfaceMesh | None, rehearsed: np.ndarray
-) -> tuple[str, ...]:
+) -> Decision | None:
     """Makes the covariances of the training views those beside matter that is not known, and as large as errors are.
 
     Where no frames are held out, that could judge, numbers also go back to the plan as far as frames do not tell them
-    (`evidence.weighed`); returned are the kinds that do so altogether. Distances are left as they are.
+    (`weighed`), and the decision which kinds of them are wrong at all is returned. Distances are left as they are.
 
     pixels: of the last images; surfaces: in the poses that were found, or None for voxels; rehearsed: [V, 7] errors of
     the numbers in a rehearsal (`rehearsal.rehearsed`), of which each kind is made as uncertain as they are.
@@ -41,7 +125,7 @@ def beside_unknown(
     free = {kind: places for kind, places in KINDS.items() if kind != "distance" and getattr(uncertain, kind) > 0}
     places = sorted(place for kind in free.values() for place in kind)
     if not places:
-        return ()
+        return None
     while min(search.scan.views.shape) // pixels > SIDE:
         pixels *= 2
     units = torch.tensor([pixels if place in range(2) else 1.0 for place in places]).double().repeat(len(train))
@@ -65,11 +149,13 @@ def beside_unknown(
     covariances[:, at[:, None], at] = torch.stack([blocks[v, :, v] for v in range(len(train))])
     search.covariances[train] = covariances
     if not moves:
-        return ()
+        return None
     numbers = search.numbers[train]
     numbers[:, at] = torch.from_numpy(judged.numbers)
     search.numbers[train] = numbers
-    return tuple(kind for kind, scale in zip(free, judged.scales) if scale == 0)
+    names = list(free)
+    wrong = ", ".join(kind for kind, scale in zip(names, judged.scales) if scale > 0)
+    return Decision(NAME, wrong or NONE, "marginal likelihood")
 
 
 def _larger(away: np.ndarray, covariance: np.ndarray, kinds: list[list[int]]) -> np.ndarray:

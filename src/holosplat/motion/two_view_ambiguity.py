@@ -1,4 +1,4 @@
-"""Which of a body and its twin (`bodies.twin`) frames of two beams show: fits decide."""
+"""The two-view ambiguity: a body or its twin (`bodies.twin`), compared by fits to the frames of two beams."""
 
 from __future__ import annotations
 
@@ -11,34 +11,31 @@ import torch
 
 from ..bodies.moments import moments, second_moments
 from ..bodies.twin import distance, map_near, twin_map, two_beams
-from ..fit.loop import Fit
 from ..fit.running import Steps
+from ..inference import Compared, Decision, Score
 from ..mesh import TriangleMesh
 from ..optics.background import Light
 from ..representations import MovingSurfaces
 from ..scan import Scan
 from .elastic import Rest
 from .fit import MotionFit, motion_fit
-from .remainder import beside, only
+from .residual_detection import beside, only, predicted
 
 APART = 0.05
 """Least distance of a body and its twin, over its extent, at which they can be distinguished."""
 STRAINED = 10.0
 """Elastic energy by which a twin may exceed its body, in units of its area times the shear modulus: in trials cells in
 flow had up to four, their twins in beams across each other half a unit more, in beams at 24° 28 and more."""
-HOPELESS = 0.05
-"""Part by which the loss of a stiff fit may be larger than without the twin for the soft fit to be made."""
 STIFF_STEPS, SOFT_STEPS, TRIAL_VIEWS = 40, 40, 4
 """Steps of the two fits of a trial, and frames of a step of Adam's: with a third of these steps a body is not yet at
 home where its twin is."""
-CLOSE = 5e-4
-"""Least relative difference of the losses of a body and its twin after these steps; later steps gain as much."""
 FIRST_LOOK = 0.7
 """About the share of the work before the closer ones are looked at again."""
 TRIAL_WORTH = 1.0
 """What a step of L-BFGS must gain there [nats]: bodies and their twins differ by ten at times."""
 SAMPLES = 4
 """Times at which a body that turns is put in its twin's place, for each coefficient of its path."""
+NAME, NONE = "twins in two beams", "none"
 Heard = Callable[[float], None]
 """Takes the share that is done."""
 
@@ -73,13 +70,17 @@ class Trials:
         return self._fitted(frames, tried.bodies, trial_of(self.soft, SOFT_STEPS))
 
     def _fitted(self, frames: Scan, start: MovingSurfaces, how: MotionFit) -> Tried:
-        def run() -> tuple[float, torch.Tensor]:
+        def run() -> tuple[torch.Tensor, torch.Tensor]:
             fit = motion_fit(frames, start, how, self.seed, self.light, self.rest)
             fit.run(lambda record: None)
-            return _left(fit)
+            found = fit.result().object
+            assert isinstance(found, MovingSurfaces)
+            left = Score.of(torch.from_numpy(frames.frames - predicted(frames, found, self.oversample)))
+            return torch.from_numpy(left.powers), found.coefficients.detach()
 
-        loss, coefficients = self.steps.of(run)
-        return Tried(loss, start.with_parameters({"coefficients": coefficients}))
+        powers, coefficients = self.steps.of(run)
+        left = Score(powers.numpy(), len(frames))
+        return Tried(left, start.with_parameters({"coefficients": coefficients}))
 
     def beside(self, bodies: MovingSurfaces, number: int) -> Scan:
         """The frames, divided by those of all `bodies` but one."""
@@ -88,50 +89,57 @@ class Trials:
 
 
 class Tried(NamedTuple):
-    """The loss of a fit, and its bodies."""
+    """What a fit leaves of its frames, and its bodies."""
 
-    loss: float
+    left: Score
     bodies: MovingSurfaces
 
+    def beside(self, body: Tried, number: int) -> Compared:
+        """The comparison of a twin with its body."""
+        return Compared(f"twin of body {number}", *self.left.gain_over(body.left))
 
-def chosen_twins(bodies: MovingSurfaces, trials: Trials, on_progress: Heard = lambda share: None) -> MovingSurfaces:
-    """`bodies` of known rest shape, each or its twin, whichever leaves less; as they are for other than two beams.
 
-    Frames are divided by those that all others predict, and the body and its twin are fitted to them, from shapes
-    without details: those that were fitted before would speak for the body that was there. Where the two leave nearly
-    the same, both fits go on when all others have been looked at.
+def chosen_twins(
+    bodies: MovingSurfaces, trials: Trials, on_progress: Heard = lambda share: None
+) -> tuple[MovingSurfaces, Decision | None]:
+    """`bodies` of known rest shape, each or its twin, and the decision; as they are for other than two beams.
+
+    Frames are divided by those that all others predict, and the body, the null, and its twin are fitted to them, from
+    shapes without details: those that were fitted before would speak for the body that was there. A twin that is surely
+    worse after a stiff fit has no soft one. Where neither is surely better after that, both fits go on when all others
+    have been looked at.
     """
     beams = two_beams(trials.train.views)
     if beams is None:
-        return bodies
+        return bodies, None
     plain, now = without_details(bodies, trials.rest), bodies
     asked, rivals = in_question(plain, beams, trials.rest), dict[int, tuple[Tried, Tried]]()
+    compared = dict[int, Compared]()
     for turn, number in enumerate(asked):
         on_progress(FIRST_LOOK * turn / len(asked))
         frames, own = trials.beside(now, number), only(plain, [number])
         first, other = (trials.begun(frames, start) for start in (own, twinned(own, 0, beams)))
-        if other.loss > (1 + HOPELESS) * first.loss:
+        compared[number] = other.beside(first, number)
+        if compared[number].loses:
             continue
-        rivals[number] = trials.gone_on(frames, first), trials.gone_on(frames, other)
-        now = _better(now, number, bodies, rivals[number])
-    close = [k for k, (first, other) in rivals.items() if abs(other.loss - first.loss) < CLOSE * first.loss]
+        first, other = rivals[number] = trials.gone_on(frames, first), trials.gone_on(frames, other)
+        compared[number] = other.beside(first, number)
+        now = _placed(now, number, other.bodies) if compared[number].wins else now
+    close = [k for k in rivals if not (compared[k].wins or compared[k].loses)]
     for turn, number in enumerate(close):
         on_progress(FIRST_LOOK + (1 - FIRST_LOOK) * turn / len(close))
         frames = trials.beside(now, number)
         first, other = (trials.gone_on(frames, tried) for tried in rivals[number])
-        now = _better(now, number, bodies, (first, other))
-    return now
+        compared[number] = other.beside(first, number)
+        now = _placed(now, number, other.bodies) if compared[number].wins else now
+    taken = ", ".join(str(number) for number, each in compared.items() if each.wins)
+    return now, Decision(NAME, taken or NONE, "training frames", tuple(compared.values()))
 
 
-def _better(now: MovingSurfaces, number: int, before: MovingSurfaces, rivals: tuple[Tried, Tried]) -> MovingSurfaces:
-    """`now` with its body `number` as it was `before`, or as its twin, if that leaves less."""
-    first, other = rivals
-    own, _ = now.body(number)
-    place = other.bodies.coefficients if other.loss < first.loss else before.coefficients.detach()[:, own]
-    if torch.equal(place, now.coefficients.detach()[:, own]):
-        return now
+def _placed(now: MovingSurfaces, number: int, twin: MovingSurfaces) -> MovingSurfaces:
+    """`now` with `twin` as its body `number`."""
     changed = now.coefficients.detach().clone()
-    changed[:, own] = place
+    changed[:, now.body(number)[0]] = twin.coefficients
     return now.with_parameters({"coefficients": changed})
 
 
@@ -196,10 +204,3 @@ def _energy(bodies: MovingSurfaces, number: int, rest: Rest) -> float:
     weights = bodies.basis.weights(np.array([0.5 * (bodies.basis.first + bodies.basis.last)]))[0]
     nodes = torch.einsum("k,kpx->px", torch.from_numpy(weights), bodies.coefficients.detach()[:, own])
     return float(rest.elastic(nodes))
-
-
-def _left(fit: Fit) -> tuple[float, torch.Tensor]:
-    """The loss of all frames and priors after `fit`, and the coefficients of its bodies' paths."""
-    found = fit.result().object
-    assert isinstance(found, MovingSurfaces)
-    return fit.left(), found.coefficients.detach()

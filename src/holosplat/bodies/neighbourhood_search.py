@@ -1,21 +1,84 @@
-"""The search for bodies of known rest shape: some are taken away, and others looked for in their place, as long as that
-explains more (large neighbourhood search: Shaw 1998, Lect. Notes Comput. Sci. 1520, 417)."""
+"""Search for bodies of known rest shape: some are replaced by others, and the best choice of all is kept."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
+from scipy.sparse import csr_array, vstack
 
 from ..fit.running import Steps
 from ..mesh import TriangleMesh
-from .pool import Pool
 from .poses import FREER, Explained, Pose
 from .pursuit import LAST_STEPS, candidates, explaining, level_pairs, searched, swapped, two_beams
 from .shadows import Shadows
 from .templates import Search, Templates
+
+
+@dataclass
+class Pool:
+    """Candidates and the shadows they cast.
+
+    What a choice of them leaves of the shadows counts by its square here, so that a table of products says what each
+    change of the choice is worth (`best_choice`). Other parts of the field are looked at in other tries; the choice
+    puts the best of all together.
+    """
+
+    every: Explained
+    poses: list[Pose] = field(default_factory=list)
+    _rows: list[csr_array] = field(default_factory=list)
+    _own: list[float] = field(default_factory=list)
+
+    def add(self, poses: Sequence[Pose]) -> None:
+        """Further candidates."""
+        for pose in poses:
+            self.poses.append(pose)
+            self._rows.append(csr_array(self.every.images([pose]).reshape(1, -1).astype(np.float32)))
+            self._own.append(self.every.strained([pose]) + float(self.every.hidden([pose])))
+
+    def chosen(self) -> list[Pose]:
+        """The choice of bodies that explains most together."""
+        if not self.poses:
+            return []
+        images = csr_array(vstack(self._rows))
+        products = (images @ images.T).toarray().astype(np.float64) / self.every.noise**2
+        gains = images @ self.every.seen.thickness.ravel() / self.every.noise**2
+        return [self.poses[k] for k in np.flatnonzero(best_choice(products, gains - self._own))]
+
+
+def best_choice(products: np.ndarray, gains: np.ndarray) -> np.ndarray:
+    """[C] x, true or false, with the least ½ xᵀ G x - gᵀ x that was found, G the products [C, C], g the gains [C].
+
+    From nothing, and from each candidate alone, the best change is made again and again: one is put in, left out, or
+    put in for another, until no such change is better (iterative improvement: Aarts & Lenstra 1997, chapter 1).
+    """
+    count, found = len(gains), list[tuple[float, np.ndarray]]()
+    for first in range(-1, count):
+        x = np.arange(count) == first
+        found.append(_improved(products, gains, x))
+    return min(found, key=lambda pair: pair[0])[1]
+
+
+def _improved(products: np.ndarray, gains: np.ndarray, x: np.ndarray) -> tuple[float, np.ndarray]:
+    """The value of the choice that single changes lead to from `x` [C], and that choice."""
+    own = 0.5 * np.diag(products)
+    while True:
+        slope = products @ x - gains
+        flips, inside, outside = np.where(x, own - slope, own + slope), np.flatnonzero(x), np.flatnonzero(~x)
+        flip = int(flips.argmin())
+        change, gone = float(flips[flip]), [flip]
+        if len(inside) and len(outside):
+            swaps = flips[inside][:, None] + flips[outside] - products[np.ix_(inside, outside)]
+            out, into = np.unravel_index(int(swaps.argmin()), swaps.shape)
+            if swaps[out, into] < change:
+                change, gone = float(swaps[out, into]), [int(inside[out]), int(outside[into])]
+        if change >= 0:
+            return float(0.5 * x @ products @ x - gains @ x), x
+        x = x.copy()
+        x[gone] = ~x[gone]
+
 
 TRIES, MOST_ROUNDS, PATIENCE = 12, 20, 3
 """Tries of a round, of which few bodies need fewer; rounds at most; and those in which nothing clearly better is found,
@@ -60,12 +123,12 @@ def pursued(
     found = [free.improved(searched(every, search, start), LAST_STEPS) for start in starts]
     best = int(np.argmin([free.value(poses) for poses in found]))
     tried = [pose for poses in found for pose in poses]
-    better = Replaced(free, search, seed).better(found[best], tried, on_progress)
+    better = NeighbourhoodSearch(free, search, seed).better(found[best], tried, on_progress)
     return free.improved(better, FREE_STEPS), best > 0
 
 
 @dataclass
-class Replaced:
+class NeighbourhoodSearch:
     """Takes some bodies away, looks for others in their place, and keeps what explains more.
 
     A pursuit takes one body at a time: the first ones may stand for the shadows of several, or for their crossing, and
@@ -117,7 +180,7 @@ class Replaced:
 
     def _best_choice(self) -> list[Pose]:
         """The best choice among all bodies that were tried, made better."""
-        other = explaining(self.every, self.every.improved(self._pool.chosen(self._draws), LAST_STEPS))
+        other = explaining(self.every, self.every.improved(self._pool.chosen(), LAST_STEPS))
         other = self.every.improved(other, LAST_STEPS)
         self._pool.add(other)
         return other

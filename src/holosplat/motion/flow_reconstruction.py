@@ -1,7 +1,7 @@
 """Flow reconstruction: one volume for all times, carried by a flow, which starts around the middle time.
 
-First it tests for motion: there is motion if a flow explains frames better than the mean of all times does, and hardly
-with the times in another order. The flow begins steady, between the times next to the middle one, on voxels of
+First it tests for motion: there is motion if a steady flow predicts frames that were set aside better than matter at
+rest does. The flow begins steady, between the times next to the middle one, on voxels of
 two pixels. Then the window grows to all times, and the flow gets a higher degree in time and more cells, as long as
 frames that are held out for a moment are predicted better. At last the volume is fitted on voxels of a pixel, and
 Gaussians stand for it.
@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from ..baselines.material import plateau
@@ -22,6 +23,7 @@ from ..checks import as_written, at_least, positive, require
 from ..fit.flow_volume import FlowProblem, likelier_fading, likelier_flow
 from ..fit.smooth_volume import descend
 from ..geometry import Grid
+from ..inference import Compared, Decision
 from ..matter import DeltaBeta, MaterialPrior, Matter
 from ..methods import Task
 from ..methods.illumination import prepared
@@ -41,15 +43,11 @@ from ..representations import (
 from ..representations.initialise import FILLED
 from ..scan import Scan
 from .freer_flow import Change, freer_flows
-from .held_out import iterations_that_predict, kept_frames
 from .journal import Journal, Nowhere
-from .timed_frames import Frames, merged, trendless
+from .timed_frames import Frames, iterations_that_predict, kept_frames, likelihood_ratio, merged
 
-SURE, AGAIN = 4.0, 2.0
-"""Standard deviations, and times what it explains of times in another order, by which a flow must explain frames before
-anything is said to move."""
-BETTER = 2.0
-"""Standard errors by which a freer flow must predict held-out frames better."""
+MOTION, STILL, FLOW = "motion", "matter at rest", "steady flow"
+FREEDOM, BY = "freedom of the flow", "frames set aside"
 NOWHERE = Nowhere()
 """No journal."""
 FEWEST_PIXELS = 24
@@ -103,7 +101,8 @@ class CarriedOptions:
 @dataclass(frozen=True)
 class Carried:
     """The result. object: the matter in motion; volume: of the reference time, on voxels; misfit: [T] χ² a pixel at
-    each time; history: what was tried, in words; timing: seconds by stage."""
+    each time; history: what was tried, in words; timing: seconds by stage; decisions: on motion, and on the flow's
+    freedom."""
 
     object: MovingGaussians
     volume: VoxelGrid
@@ -111,6 +110,7 @@ class Carried:
     misfit: list[float]
     history: tuple[str, ...]
     timing: dict[str, float]
+    decisions: tuple[Decision, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -138,6 +138,7 @@ class Search:
         self.middle = len(self.times) // 2
         self.factor = 2 if min(views.shape) >= FEWEST_PIXELS else 1
         self.prior, self.history, self.timing = options.volume.prior, list[str](), dict[str, float]()
+        self.decisions = list[Decision]()
         self._strength, self._step, self._saved = 1.0, 0, dict[str, Any]()
         self._extents = ((wide := views.width / views.finest), views.height / views.finest, wide)
 
@@ -163,47 +164,45 @@ class Search:
         return Flow.still(lattice, basis, middle, self.options.steps, self.options.sources)
 
     def moves(self, still: VoxelGrid) -> bool:
-        """Whether a steady flow explains frames that matter which stands `still` does not."""
-        began = clock.perf_counter()
-        state, count = self._still(self.on(still, self.factor)), len(self.times)
-        gain, chance = (self._gain(order, state) for order in (list(range(count)), trendless(count)))
-        what = "a steady flow takes" if state.fading is None else "a steady flow and a change of δ take"
-        self.history.append(f"{what} {gain:.0f} from ½χ², of times in another order {chance:.0f}")
+        """Whether a steady flow of matter that is `still` otherwise predicts frames better that it was not fitted to;
+        with a change of amplitudes, where that may be. All frames are set aside in turn, a part of them at a time."""
+        state = self._still(self.on(still, self.factor))
+
+        began, left = clock.perf_counter(), list[tuple[Tensor, Tensor]]()
+        for fold in range(self.options.held_out):
+            self.task.on_progress("does it move", fold / self.options.held_out)
+            keep = self._training_mask(fold)
+            moving = self._update_flow(self._problem_of_all(state, keep), state)
+            left.append((self.left_out(state, ~keep), self.left_out(moving, ~keep)))
+        found = likelihood_ratio(FLOW, *(torch.cat(frames) for frames in zip(*left)))
         self.timing["does it move"] = clock.perf_counter() - began
-        return gain > SURE**2 + AGAIN * chance
+        self._decide(MOTION, STILL, found, began)
+        return found.wins
+
+    def _decide(self, name: str, null: str, found: Compared, began: float) -> None:
+        """Keep the decision on a candidate beside the null."""
+        seconds = round(clock.perf_counter() - began, 2)
+        self.decisions.append(Decision(name, found.name if found.wins else null, BY, (found,), seconds))
 
     def _still(self, u: Tensor) -> _State:
         """The state without motion and fading."""
         flow = self.steady(self.options.cells)
         return _State(flow, u, Fading.none(flow.lattice) if self.options.fading > 0 else None)
 
-    def _gain(self, order: list[int], state: _State) -> float:
-        """What a steady flow, and a change of amplitudes where that may be, takes from ½χ² where the times come in
-        `order`."""
-        problem, steps = self.problem(order, self.factor, state, times=self.times), self.options.iterations
-        flow, values = likelier_flow(problem, state.u, state.flow, steps, self.options.strain)
-        gain = values[0] - min(values)
-        if state.fading is None:
-            return gain
-        problem.carry(flow)
-        _, values = likelier_fading(problem, state.u, state.fading, flow, steps, self.options.fading)
-        return gain + values[0] - min(values)
-
     def problem(
-        self,
-        which: Sequence[int] | range,
-        factor: int,
-        state: _State,
-        keep: np.ndarray | None = None,
-        times: np.ndarray | None = None,
+        self, which: Sequence[int] | range, factor: int, state: _State, keep: np.ndarray | None = None
     ) -> FlowProblem:
-        """The frames of the times numbered `which`; keep: [T, V] bool, of these frames; times: other ones for them."""
+        """The frames of the times numbered `which`; keep: [T, V] bool, of these frames."""
         frames = [self.frames.whitened(k, factor, None if keep is None else keep[k]) for k in which]
         prior = self.prior if factor == 1 else self.prior.on_larger_voxels(factor)
-        taken = self.times[list(which)] if times is None else times
-        problem = FlowProblem(frames, taken.tolist(), prior, plateau(state.u), state.flow, factor)
+        times = self.times[list(which)].tolist()
+        problem = FlowProblem(frames, times, prior, plateau(state.u), state.flow, factor)
         problem.fade(state.fading, state.flow)
         return problem
+
+    def _problem_of_all(self, state: _State, keep: np.ndarray | None = None) -> FlowProblem:
+        """The frames of all times, or those that `keep` [T, V] says."""
+        return self.problem(range(len(self.times)), self.factor, state, keep)
 
     def on(self, volume: VoxelGrid, factor: int) -> Tensor:
         """The values [Z, Y, X] of a volume on voxels of `factor` pixels."""
@@ -215,15 +214,16 @@ class Search:
     def turns(self, problem: FlowProblem, state: _State, rounds: int = 1) -> _State:
         """Flow, fading and volume in turns, each by `iterations`."""
         for _ in range(rounds):
-            state = self._update_flow(problem, state, self.options.iterations)
+            state = self._update_flow(problem, state)
             u, _ = descend(problem, state.u, self.options.iterations)
             state = replace(state, u=u)
         return state
 
-    def _update_flow(self, problem: FlowProblem, state: _State, steps: int) -> _State:
+    def _update_flow(self, problem: FlowProblem, state: _State, steps: int | None = None) -> _State:
         """`state` with a likelier flow, and then, where the problem is of all times, a likelier fading, which it takes,
         too: in a few times what moves may pass for what fades."""
         how, u, fading = self.options, state.u, state.fading
+        steps = how.iterations if steps is None else steps
         flow, _ = likelier_flow(problem, u, state.flow, steps, how.strain, how.divergence)
         problem.carry(flow)
         if fading is not None and len(problem.times) == len(self.times):
@@ -248,6 +248,7 @@ class Search:
         with as_written("checkpoint.pt", "a checkpoint of this run"):
             self._saved, self.history = {**saved, "steps": int(saved.get("steps", 0))}, list(saved["history"])
             self._strength = float(saved["strength"])
+            self.decisions = [Decision.from_dict(one) for one in saved.get("decisions", ())]
             self.timing = {str(name): float(seconds) for name, seconds in saved["timing"].items()}
             self.prior = self.options.volume.prior.weakened(self._strength)
 
@@ -257,6 +258,7 @@ class Search:
         if state is not None and state.fading is not None:
             found["fading"] = state.fading.coefficients
         found |= {"history": list(self.history), "timing": dict(self.timing), "strength": self._strength}
+        found["decisions"] = [one.as_dict() for one in self.decisions]
         self.journal.save({"steps": self._step, **found})
 
     def run(self) -> Carried:
@@ -305,39 +307,30 @@ class Search:
         count, keep, how = len(self.times), self._training_mask(), self.options
         for change in freer_flows(self._extents, (how.cells, how.most_cells), min(how.most_degree, count - 2)):
             state = self._run_stage("flow", lambda s=state, c=change: self._try_freer_flow(s, c, keep))
-        return self._run_stage("flow", lambda: self.turns(self._whole(state, range(count)), state))
+        return self._run_stage("flow", lambda: self.turns(self._problem_of_all(state), state))
 
-    def _training_mask(self) -> np.ndarray:
+    def _training_mask(self, fold: int = 0) -> np.ndarray:
         """[T, V] bool: the frames that are not held out."""
-        return kept_frames(len(self.times), len(self.frames.scans[0]), self.options.held_out, self.task.seed)
+        return kept_frames(len(self.times), len(self.frames.scans[0]), self.options.held_out, self.task.seed, fold)
 
     def _try_freer_flow(self, state: _State, change: Change, keep: np.ndarray) -> _State:
         """The state with a freer flow, if that predicts the frames better that `keep` [T, V] leaves out."""
-        wanted, count = change(state.flow), len(self.times)
+        wanted = change(state.flow)
         if wanted is None:
             return state
-        kept = self.problem(range(count), self.factor, state, keep)
+        began, kept = clock.perf_counter(), self._problem_of_all(state, keep)
         same = self.turns(kept, state)
         kept.carry(wanted)
         kept.fade(state.fading, wanted)
         other = self.turns(kept, replace(state, flow=wanted))
-        errors = [self.left_out(one, ~keep) for one in (same, other)]
-        gain = errors[0] - errors[1]
-        better = bool(gain.mean() > BETTER * gain.std(ddof=1) / np.sqrt(len(gain)))
-        size = f"degree {wanted.basis.degree}, {' × '.join(map(str, wanted.lattice.counts))} nodes"
-        self.history.append(f"{size}: {gain.mean():+.1f} of ½χ² a held-out frame{', taken' if better else ''}")
-        return other if better else state
+        found = likelihood_ratio(_size(wanted), self.left_out(same, ~keep), self.left_out(other, ~keep))
+        self._decide(FREEDOM, _size(state.flow), found, began)
+        return other if found.wins else state
 
-    def left_out(self, state: _State, left: np.ndarray) -> np.ndarray:
-        """½χ² of each of the frames `left` [T, V] bool."""
-        found: list[float] = []
-        for k in np.flatnonzero(left.any(1)):
-            for v in np.flatnonzero(left[k]):
-                one = np.zeros(left.shape, dtype=bool)
-                one[k, v] = True
-                problem = self.problem([int(k)], self.factor, state, one)
-                found.append(problem.misfit(state.u)[0])
-        return np.array(found)
+    def left_out(self, state: _State, left: np.ndarray) -> Tensor:
+        """[F, H, W] what `state` leaves of the frames `left` [T, V] bool, over their noise."""
+        times = np.flatnonzero(left.any(1)).tolist()
+        return self.problem(times, self.factor, state, left).residuals(state.u)
 
     def finished(self, state: _State) -> Carried:
         """The state on voxels of a pixel, and the Gaussians that stand for it."""
@@ -347,7 +340,8 @@ class Search:
         misfit = [2 * one / pixels for one in problem.misfit(state.u)]
         volume = self._volume(state.u, 1)
         found = self.gaussians(volume, state)
-        return Carried(found, volume, state.flow, misfit, tuple(self.history), self.timing)
+        said = tuple(self.history), self.timing, tuple(self.decisions)
+        return Carried(found, volume, state.flow, misfit, *said)
 
     def _volume(self, u: Tensor, factor: int) -> VoxelGrid:
         return VoxelGrid(u[None], self._grid(factor), Matter.one(*self.frames.material))
@@ -398,3 +392,7 @@ class Search:
             one, two = (self.times[[0, -1]] - flow.reference) / (flow.basis.last - flow.basis.first)
             change = state.fading.of_raw(cloud.centres, cloud.raw_amplitudes[:, 0], (float(one), float(two)))
         return MovingGaussians(cloud, flow, change)
+
+
+def _size(flow: Flow) -> str:
+    return f"degree {flow.basis.degree}, {' × '.join(map(str, flow.lattice.counts))} nodes"

@@ -13,6 +13,7 @@ import torch
 from ..bodies.rest_shape import KnownBody, extent_like
 from ..checks import InputError, as_written, require
 from ..fit.running import Record, Steps
+from ..inference import Decision
 from ..learning.network import Guess
 from ..matter import DeltaBeta
 from ..mesh import TriangleMesh
@@ -20,19 +21,17 @@ from ..optics.background import Light
 from ..progress import FitProgress
 from ..representations import MovingSurfaces, TimeBasis
 from ..scan import Scan
+from .detections import Detection, SightingOptions, network_for, sightings
 from .elastic import Rest
 from .fit import MotionFit, motion_fit
-from .guesses import network_for
-from .halves import astray, halves_of, tell_shapes
 from .journal import Journal, from_sightings, to_sightings
 from .known import KnownBodies, at_rest
-from .mergers import without_merger
 from .pieces import chosen_paths
-from .remainder import apart, beside, joined, only, sure_ones, whole_ones
-from .sightings import Sighting, SightingOptions, sightings
-from .start import first_paths
+from .residual_detection import apart, beside, joined, only, sure_ones, whole_ones, without_merger
+from .split_half_errors import astray, halves_of, tell_shapes
+from .track_linking import first_paths
 from .track_options import TrackOptions
-from .twins import Trials, chosen_twins
+from .two_view_ambiguity import Trials, chosen_twins
 
 CHECKPOINT_SECONDS = 20.0
 """What a stage has come to is kept so often [s]."""
@@ -47,7 +46,8 @@ class Followed:
     """The tracked bodies. bodies: on their paths; records: of the steps of all fits; oversample: wave samples a pixel
     in these; timing: seconds of each stage; found: how many bodies each time shows by itself; halves: the bodies by
     halves of the frames, two and two, empty without intervals; rest: their shape at rest [m], if that is known; begun:
-    the detection method at single times, in words; body: their known shape, given or found."""
+    the detection method at single times, in words; body: their known shape, given or found; decisions: on detections,
+    pieces of paths, twins, and the kind of bodies."""
 
     bodies: MovingSurfaces
     records: list[Record]
@@ -58,10 +58,11 @@ class Followed:
     rest: TriangleMesh | None = None
     begun: str = ""
     body: KnownBody | None = None
+    decisions: tuple[Decision, ...] = ()
 
 
 @dataclass
-class Following:
+class BodyTracker:
     """Tracking stage by stage: sightings, then stiff fits and looks beside their bodies in turn,
     then paths, the soft fit, and fits to halves of the frames."""
 
@@ -75,11 +76,12 @@ class Following:
     stage: str = "sightings"
     round: int = 0
     bodies: MovingSurfaces | None = None
-    seen: list[list[Sighting]] = field(default_factory=list)
+    seen: list[list[Detection]] = field(default_factory=list)
     counts: list[int] = field(default_factory=list)
     records: list[Record] = field(default_factory=list)
     timing: dict[str, float] = field(default_factory=dict)
     halves: list[MovingSurfaces] = field(default_factory=list)
+    decisions: list[Decision] = field(default_factory=list)
     oversample: int = 1
     size: float = 1.0
     """Of all bodies of known rest shape, beside what was said."""
@@ -113,7 +115,8 @@ class Following:
         self.halves = [MovingSurfaces.from_state(one) for one in saved["halves"]]
         self._begun, self.size, self.guess = saved["fit"], float(saved["size"]), str(saved["guess"])
         self.cells = float(saved["cells"])
-        self._steps = Steps(saved.get("steps", ()), self._save_now_and_then)
+        self.decisions = [Decision.from_dict(one) for one in saved.get("decisions", ())]
+        self._steps = Steps(saved.get("stage_steps", ()), self._save_now_and_then)
 
     def _save(self, fit: Mapping[str, Any] | None = None) -> None:
         """Write the journal; fit: the state of the one that runs, which starts at `bodies`."""
@@ -121,7 +124,8 @@ class Following:
         state |= {"size": self.size, "guess": self.guess, "cells": self.cells}
         state |= {"bodies": None if self.bodies is None else self.bodies.state(), "fit": fit}
         state |= {"seen": from_sightings(self.seen), "records": self.records, "timing": self.timing}
-        self.journal.save(state | {"halves": [one.state() for one in self.halves], "steps": self._steps.done})
+        state |= {"decisions": [one.as_dict() for one in self.decisions], "stage_steps": self._steps.done}
+        self.journal.save(state | {"halves": [one.state() for one in self.halves]})
         self._kept = time.perf_counter()
 
     def _save_now_and_then(self) -> None:
@@ -138,7 +142,8 @@ class Following:
         """The tracked bodies; said: a sentence on their kind."""
         assert self.bodies is not None
         told = self.records, self.oversample, self.timing, tuple(self.counts), tuple(self.halves)
-        return Followed(self.bodies, *told, self.shape_at_rest(), self.guess + said, self.options.body)
+        guess, made = self.guess + said, tuple(self.decisions)
+        return Followed(self.bodies, *told, self.shape_at_rest(), guess, self.options.body, made)
 
     def advance(self) -> None:
         """Do the stage that is next."""
@@ -216,15 +221,16 @@ class Following:
         with self._record_time("sightings"):
             found, decision = network_for(at, self.material, *how, lambda stage, part: None)
         self.guess = decision.line
+        self.decisions.append(decision)
         return found
 
-    def look(self, frames: Scan, level: float = 1.0, network: Guess | None = None) -> list[list[Sighting]]:
+    def look(self, frames: Scan, level: float = 1.0, network: Guess | None = None) -> list[list[Detection]]:
         """The bodies that each time of `frames` shows by itself.
 
         level: factor of the occupancy at the surface; network: what guesses the volumes.
         """
         how = replace(self.options.sightings, level=level * self.options.sightings.level)
-        times, found = frames.instants, list[list[Sighting]]()
+        times, found = frames.instants, list[list[Detection]]()
         with self._record_time("sightings"):
             for t in range(len(times)):
                 self.on_progress("bodies at each time", t / len(times), {})
@@ -320,14 +326,21 @@ class Following:
         how = (self.options.stiff, self.options.soft, self.oversample, self.seed, self.light, self._steps)
         trials = Trials(self.train, self.rest, *how)
         with self._record_time("twins"):
-            return chosen_twins(bodies, trials, lambda share: self.on_progress("twins", share, {}))
+            found = chosen_twins(bodies, trials, lambda share: self.on_progress("twins", share, {}))
+        return self._decided(*found)
 
     def on_chosen_paths(self, bodies: MovingSurfaces) -> MovingSurfaces:
         """`bodies` on paths of as many pieces as the frames support."""
         how = (self.options.paths, self.options.stiff, self.seed, self.light, self.rest)
         self.on_progress("paths", 0.0, {})
         with self._record_time("paths"):
-            return chosen_paths(self.train, bodies, *how, steps=self._steps)
+            found = chosen_paths(self.train, bodies, *how, steps=self._steps)
+        return self._decided(*found)
+
+    def _decided(self, bodies: MovingSurfaces, decision: Decision | None) -> MovingSurfaces:
+        """`bodies`, whose decision is kept."""
+        self.decisions += [] if decision is None else [decision]
+        return bodies
 
     def fitted(
         self, name: str, frames: Scan, start: MovingSurfaces, how: MotionFit, light: Light | None

@@ -1,8 +1,4 @@
-"""Which sightings are one body: links from one time to the next, gaps closed, doubles left out.
-
-Numbers of sightings alone: centres, volumes, and whether the field cuts them. A body that is merged with another, or
-split, at some times breaks its track there: the pieces are joined where their straight paths meet.
-"""
+"""Links of detections into tracks, and bodies on first paths along them."""
 
 from __future__ import annotations
 
@@ -12,8 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from ..checks import at_least, in_range
+from ..checks import at_least, in_range, require
+from ..inference import Score, select
+from ..matter import DeltaBeta, Matter
 from ..ranges import ranged
+from ..representations import MovingSurfaces, TimeBasis
+from .detections import Detection
 
 FAR = 1e9
 """Cost of a pair that cannot be."""
@@ -200,3 +200,80 @@ def place_at(track: Track, time: int, seen: Sequence[Seen], times: np.ndarray, f
 
 def _is_accepted(track: Track, seen: Sequence[Seen], options: LinkOptions) -> bool:
     return len(track) >= options.least or any(seen[k].cut for k in track)
+
+
+USUAL = LinkOptions()
+"""The usual options of linking detections."""
+
+
+def first_paths(
+    found: Sequence[Sequence[Detection]],
+    times: np.ndarray,
+    basis: TimeBasis,
+    pixel: float,
+    material: DeltaBeta,
+    options: LinkOptions = USUAL,
+) -> MovingSurfaces:
+    """Bodies on first paths, from the sightings at each of `times` [T] s, those with the most sightings first.
+
+    A body has the surface of its best time, and is moved without turning; pixel: [m], the unit of lengths. Errors:
+    `InputError` if there is no body at all.
+    """
+    flat = [(t, one) for t, bodies in enumerate(found) for one in bodies]
+    seen = [Seen(t, one.centre, one.volume, one.cut) for t, one in flat]
+    tracks = identified(seen, times, options)
+    require(
+        len(tracks) > 0,
+        "no body was found that can be followed from one time to the next; check the material, or look at single times "
+        "with reconstruct --time-frame.",
+    )
+    flow = drift(tracks, seen, times)
+    paths, faces = [], []
+    for track in tracks:
+        best = best_sighting(track, seen)
+        mesh = flat[best][1].mesh
+        middle = _middle(track, best, seen, times, flow, basis)
+        paths.append(mesh.vertices[None] - seen[best].centre + middle[:, None])
+        faces.append(mesh.faces)
+    return MovingSurfaces.of_bodies(paths, faces, basis, pixel, Matter.one(*material))
+
+
+def best_sighting(track: Track, seen: Sequence[Seen]) -> int:
+    """The best detection of a track: of the whole ones that of median volume; else the largest."""
+    whole = [k for k in track if not seen[k].cut]
+    if not whole:
+        return max(track, key=lambda k: seen[k].volume)
+    middle = float(np.median([seen[k].volume for k in whole]))
+    return min(whole, key=lambda k: (abs(seen[k].volume - middle), k))
+
+
+def _middle(
+    track: Track, best: int, seen: Sequence[Seen], times: np.ndarray, flow: np.ndarray, basis: TimeBasis
+) -> np.ndarray:
+    """Coefficients [K, 3] [m] of the path of the middle: with the velocity of the flow, the null, or a polynomial of
+    degree one or two, whichever predicts detections that it was not fitted to (`inference.select`).
+
+    Beside the flow, it passes the middle of the best detection, whose surface it carries.
+    """
+    whole = [k for k in track if not seen[k].cut]
+    when, centres = times[[seen[k].time for k in whole]], np.array([seen[k].centre for k in whole])
+    dense, velocity = np.linspace(basis.first, basis.last, 4 * basis.count), flow * (basis.degree > 0)
+
+    def path(degree: int, kept: np.ndarray, at: np.ndarray) -> np.ndarray:
+        away = centres[kept] - (when[kept] - basis.first)[:, None] * velocity
+        powers = np.polynomial.polynomial.polyfit((when[kept] - basis.first) / scale, away, degree)
+        return (
+            np.polynomial.polynomial.polyval((at - basis.first) / scale, powers).T
+            + (at - basis.first)[:, None] * velocity
+        )
+
+    def left_out(name: str, fold: int) -> Score:
+        every = np.arange(len(whole))
+        missed = [centres[k] - path(int(name), every != k, when[[k]])[0] for k in every]
+        return Score(np.square(missed).sum(axis=1)[:, None])
+
+    degrees, scale = [str(n) for n in range(min(2, basis.degree) + 1) if len(whole) > n + 1], basis.last - basis.first
+    chosen = int(select("degree of a path", degrees, left_out, by="detections left out").choice) if degrees else 0
+    if chosen > 0:
+        return basis.fitted(dense, path(chosen, np.arange(len(whole)), dense))
+    return basis.fitted(dense, seen[best].centre + (dense - times[seen[best].time])[:, None] * velocity)

@@ -2,7 +2,7 @@
 
 Two beams leave shapes open, and bodies of unknown shape stay poor in them, while red cells are found by their shape at
 rest. Where a network that knows red cells alone guesses bodies that frames do not contradict, cells of that size are
-looked for. They are kept unless bodies of any shape, which are freer, leave clearly less of the frames.
+looked for: the null. Bodies of any shape, which are freer, must explain the frames better (`inference.select`).
 """
 
 from __future__ import annotations
@@ -10,19 +10,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
+import torch
 
 from ..checks import InputError, as_written
-from ..units import in_percent
-from .following import Followed, Following
+from ..inference import Score, select
+from .body_tracker import BodyTracker, Followed
 from .journal import Journal
-from .remainder import predicted
+from .residual_detection import predicted
 
-CLEARLY = 0.95
-"""What bodies of any shape must leave of what cells leave: so much freer in two beams, they follow noise and explain by
-ghosts what they miss."""
-TINY = 1e-12
-"""Contrast that is divided by at least."""
+NAME, CELLS, ANY = "shape of the bodies", "red cells", "any shape"
 
 
 class Parts:
@@ -62,13 +58,14 @@ class Part:
         self._parts.save(self._name, state)
 
 
-def cells_or_any(cells: Following, other: Following) -> Followed:
+def compared_kinds(cells: BodyTracker, other: BodyTracker) -> Followed:
     """What `cells`, of red cells, found, or `other`, of bodies of any shape, which has its sightings.
 
     Errors: those of either; where there are no cells of that size, of `other` alone.
     """
     if cells.stage == "sightings":
         cells.seen, cells.counts, cells.guess, cells.stage = other.seen, other.counts, other.guess, "first paths"
+        cells.decisions = list(other.decisions)
     try:
         cells.until("stiff")
     except InputError:  # no cell of that size
@@ -76,17 +73,15 @@ def cells_or_any(cells: Following, other: Following) -> Followed:
         return other.followed("; no red cells of their size were found")
     cells.until("halves")
     other.until("halves")
-    left, beside = residual(cells), residual(other)
-    said = f"; as red cells of their size they leave {in_percent(left)} of the contrast, as bodies of any shape "
-    said += f"{in_percent(beside)}, and are followed as "
-    kept, name = (other, "such") if beside < CLEARLY * left else (cells, "cells")
+    scores = {CELLS: unexplained(cells), ANY: unexplained(other)}
+    decision = select(NAME, tuple(scores), lambda name, fold: scores[name], by="training frames")
+    kept = cells if decision.choice == CELLS else other
+    kept.decisions = [*(each for each in kept.decisions if each.name != NAME), decision]
     kept.until("done")
-    return kept.followed(said + name)
+    return kept.followed()
 
 
-def residual(of: Following) -> float:
-    """Residual of the frames over their contrast, root mean squares."""
+def unexplained(of: BodyTracker) -> Score:
+    """What the bodies leave of the training frames."""
     assert of.bodies is not None
-    frames = of.train.frames
-    left = frames - predicted(of.train, of.bodies, of.oversample)
-    return float(np.linalg.norm(left) / max(float(np.linalg.norm(frames - 1)), TINY))
+    return Score.of(torch.from_numpy(of.train.frames - predicted(of.train, of.bodies, of.oversample)))

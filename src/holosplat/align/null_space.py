@@ -1,12 +1,15 @@
-"""Null space of beams in one plane: undetermined combinations of their parameters, in words and in their errors."""
+"""Directions of pose space that frames do not determine."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from ..geometry import Views
+from .derivatives import NUMBERS
 from .row_sums import COUNT, FACTOR, RETRIEVED
 
 NAMES = ("shift x", "shift y", "turn x", "turn y", "roll")
@@ -92,3 +95,32 @@ def beside(columns: np.ndarray) -> np.ndarray:
     """Orthonormal columns of the space beside that of `columns` [N, K]."""
     basis, sizes, _ = np.linalg.svd(columns)
     return basis[:, np.count_nonzero(sizes > 1e-9 * max(sizes.max(initial=0.0), 1e-12)) :]
+
+
+HARDLY = 0.3
+"""A direction is hardly told if more than this part of its prior standard deviation is left."""
+SHARES = 0.35
+"""A number belongs to a direction if it has this part of it, in units of its own prior deviation."""
+
+
+def hardly_told(covariances: Tensor, expected: Tensor) -> list[str]:
+    """Describe each direction of pose space that some views hardly determine, given the matter.
+
+    covariances: [V, K, K] of `NUMBERS`, prior included; expected: [K] prior standard deviations, 0 for what stays.
+    Numbers are taken in units of these, so that an undetermined direction has the variance 1.
+    """
+    free = torch.nonzero(expected > 0)[:, 0]
+    units = expected[free]
+    scaled = covariances[:, free][:, :, free] / (units[:, None] * units)
+    values, ways = torch.linalg.eigh(scaled)
+    found = dict[str, list[tuple[int, float]]]()
+    for view in range(len(covariances)):
+        left, way = float(values[view, -1].clamp_min(0).sqrt()), ways[view, :, -1]
+        if left > HARDLY:
+            parts = [NUMBERS[int(free[k])] for k in torch.nonzero(way.abs() >= SHARES)[:, 0]]
+            found.setdefault(" with ".join(parts), []).append((view, left))
+    return [
+        f"hardly told: {name}, in views {', '.join(str(view) for view, _ in views)} "
+        f"({max(left for _, left in views):.0%} of what was uncertain is left)"
+        for name, views in found.items()
+    ]
