@@ -121,7 +121,8 @@ class FirstVolumes:
         """The volume of the fitted frames of a fold, which were measured in `light`."""
         seen, _ = self.folds.split(fold)
         even, lines = replace(seen, frames=light.evened(torch.from_numpy(seen.frames)).numpy()), None
-        if light.is_plain and self.folds.by == BY_VIEWS:
+        plain = light.background is None and light.still is None and not light.noise.has_grain
+        if plain and self.folds.by == BY_VIEWS:
             lines = self.once("thickness", 0, self._thickness)[self.folds.kept(fold)]
         values, grid = holographic_tv(even, self.material, self.options, self.on_progress, light, lines=lines)
         return VoxelGrid(values[None], grid, Matter.one(*self.material)).on(resolve(self.options.backend))

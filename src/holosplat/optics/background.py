@@ -106,11 +106,6 @@ class Light:
         return cls(air, NoiseModel.of_frames(frames, air), background)
 
     @property
-    def is_plain(self) -> bool:
-        """Whether light is even and noise white, so that the frames stay as they were measured."""
-        return self.background is None and self.still is None and not self.noise.has_grain
-
-    @property
     def in_words(self) -> str:
         """The estimated light in words, with root mean square deviations from one."""
         said = []
