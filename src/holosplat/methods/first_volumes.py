@@ -96,7 +96,7 @@ class FirstVolumes:
     on_progress: Progress
     options: HolographicTV = field(
         default_factory=lambda: HolographicTV(
-            retrieval=20, iterations=80, corrections=3, upper=0.0, refine=1, beyond=False
+            retrieval=20, iterations=80, corrections=3, upper=0.0, refine=1, beyond=False, relit=1
         )
     )
     taken: tuple[str, ...] = ()

@@ -5,7 +5,7 @@ Training frames prefer the freer kind, which also explains by half a density wha
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cache, partial
 
 import torch
@@ -21,11 +21,11 @@ from .method import Method, Task, run_stages
 STAGE = "kinds of results"
 
 
-@dataclass
 class _LastOfEachKind:
     """The last state of each kind of Objects in a run, and its wave samples a pixel."""
 
-    states: dict[str, tuple[Stored, int]] = field(default_factory=dict)
+    def __init__(self) -> None:
+        self.states: dict[str, tuple[Stored, int]] = {}
 
     def look(self, name: str, found: Stored, oversample: int, fitted: bool = True) -> None:
         """Keep this one."""
