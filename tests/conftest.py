@@ -144,7 +144,7 @@ def gpu(monkeypatch: pytest.MonkeyPatch) -> torch.device:
 @pytest.fixture(autouse=True)
 def _on_the_cpu(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """The backend `auto` means the CPU in tests that do not ask for a GPU: their results are the same everywhere."""
-    if GPU and "gpu" not in request.fixturenames:
+    if GPU and not {"gpu"} & {*request.fixturenames, *(mark.name for mark in request.node.iter_markers())}:
         monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
 
 
