@@ -149,7 +149,7 @@ def others(side: int, edge: int, device: str, time: Callable[[Callable[[], Any],
     from holosplat.specimens.phantoms import unit_ball
 
     found, repeats = Table(), 10
-    ball, faces = unit_ball(max(2, round(math.log2(side)) - 1))
+    ball, faces = unit_ball(max(2, round(math.log2(side)) - 2))
     points = torch.from_numpy(0.4 * side * ball).to(device).requires_grad_()
     poses = tuple(torch.from_numpy(a).to(device) for a in (Rotation.random(16, rng=0).as_matrix(), np.zeros((16, 2))))
     corners = torch.tensor(faces, device=device)
