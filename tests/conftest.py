@@ -135,7 +135,7 @@ def gpu(monkeypatch: pytest.MonkeyPatch) -> torch.device:
     if not TRITON:
         pytest.skip("triton is not installed")
     if GPU:
-        monkeypatch.setattr(torch.cuda, "is_available", lambda: True)  # which `_on_the_cpu` hides from parameters' tests
+        monkeypatch.setattr(torch.cuda, "is_available", lambda: True)  # hidden where a test asks for this late
     else:
         monkeypatch.setenv("TRITON_INTERPRET", "1")
     return torch.device("cuda" if GPU else "cpu")
