@@ -121,6 +121,16 @@ TABLES["sizes"] = Table(
     "python benchmarks/sizes.py --pixels 128 256 512 1024 --method auto --csv docs/data/sizes.csv",
     "minutes",
 )
+TABLES["gpu"] = Table(
+    measured.gpu, ("gpu.csv",), "python benchmarks/gpu.py --csv docs/data/gpu.csv", "a minute, with a GPU"
+)
+TABLES["gpu-runs"] = Table(
+    measured.gpu_runs,
+    ("gpu_runs.csv",),
+    "python benchmarks/sizes.py --pixels 256 512 --method auto --backend cuda --csv docs/data/gpu_runs.csv, and 256 "
+    "pixels with --backend cpu",
+    "a minute, with a GPU",
+)
 TABLES["triangles"] = Table(
     measured.triangles,
     ("triangles.csv",),

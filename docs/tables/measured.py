@@ -118,3 +118,23 @@ def cell() -> str:
         lines.append([views, distance, photons if photons != "0" else "–", "nothing" if unknown else "δ/β", *errors])
     head = ("views", "λz / pixel²", "photons", "told", "held-out phase", "total phase", "held-out hologram")
     return markdown((*head, "processor / s"), lines)
+
+
+def gpu() -> str:
+    """Kernels, and steps of a fit, on a GPU."""
+    lines = list[list[str]]()
+    for row in read("gpu.csv"):
+        rate = f"{float(row['pairs_per_s']) / 1e9:.0f}" if row["pairs_per_s"] else "–"
+        error = f"{float(row['error']):.1e}" if row["error"] else "–"
+        lines.append([row["what"], row["way"], rounded(row["ms"], 2), rate, error])
+    return markdown(("what", "way", "time / ms", "1e9 pairs/s", "error"), lines)
+
+
+def gpu_runs() -> str:
+    """Whole runs by a GPU and by processors of the same machine."""
+    lines = list[list[str]]()
+    for row in read("gpu_runs.csv"):
+        scores = [rounded(row[name], 4) for name in ("ssim", "frcm", "dice", "relative_error_delta")]
+        lines.append([row["pixels"], row["machine"], *scores, row["seconds"], row["cpu_seconds"]])
+    head = ("pixels", "machine", "SSIM", "FRCM", "Dice", "error of δ", "time / s", "of processors / s")
+    return markdown(head, lines)
