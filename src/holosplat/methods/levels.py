@@ -61,7 +61,7 @@ def decide_matter(task: Task, methods: Mapping[MatterKind, Method] | None = None
     def scored(name: str, fold: int) -> Score:
         return fits.score(name_of(first.taken), kind_of(name), fold, two=name == LEVELS[1])
 
-    return select(NAME, candidates, scored, by=f"{first.folds.by}, by fits")
+    return select(NAME, candidates, scored, first.folds.count, by=f"{first.folds.by}, by fits")
 
 
 class _FlatVolumes:
