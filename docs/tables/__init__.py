@@ -179,7 +179,10 @@ TABLES["assimilation"] = Table(
     moving.assimilation, ("assimilation.csv",), "python benchmarks/assimilation.py --write", "five minutes"
 )
 TABLES["tracked-carrier"] = Table(
-    moving.carrier, ("carrier.csv",), "python benchmarks/carrier.py DATA --cases flow4 --write", "ten minutes"
+    moving.carrier,
+    ("carrier.csv",),
+    "python benchmarks/carrier.py DATA --cases flow4 --write, as of commit 6bfff929",
+    "ten minutes",
 )
 TABLES["moving_methods"] = Table(
     moving.moving_methods,
