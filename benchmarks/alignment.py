@@ -13,13 +13,13 @@ too (`refined`, as --refine does).
 from __future__ import annotations
 
 import argparse
-import csv
 import platform
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from rows import merge
 from scipy.spatial.transform import Rotation
 
 import holosplat as hs
@@ -213,16 +213,6 @@ def together(scan: hs.Scan, true: hs.Exposures) -> hs.Exposures:
     return replace(scan.exposures, views=replace(views, rotations=rotations, shifts=shifts))
 
 
-def write_rows(name: str, new: list[Row]) -> None:
-    """Put the rows of a case into the table, in place of those that it has."""
-    with TABLE.open(newline="", encoding="utf-8") as file:
-        old = [row for row in csv.DictReader(file) if row["case"] != name]
-    with TABLE.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, FIELDS, restval="", lineterminator="\n")
-        writer.writeheader()
-        writer.writerows([*old, *new])
-
-
 def main() -> None:
     """Run cases; rows of others stay."""
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
@@ -231,8 +221,7 @@ def main() -> None:
     wanted = parser.parse_args()
     commit = source_commit()  # before the table is written, which is part of the tree
     for name in wanted.cases:
-        new = rows_of(name, CASES[name], wanted.moments, commit)
-        write_rows(name, new)
+        merge(rows_of(name, CASES[name], wanted.moments, commit), TABLE, "case", columns=FIELDS)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,6 @@ curves of each run, and for the pictures the maps of the studies of seed 0.
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import os
 import subprocess
@@ -28,6 +27,7 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
+from rows import read, write
 
 from holosplat.io.atomic import atomic_path
 from holosplat_bench.thesis.configurations import BESIDE, DECLARED, EVERY, EXTRA, PACES, THESIS_TABLE
@@ -87,10 +87,7 @@ def finished(runs: Path, task: Task) -> bool:
 
 def collected() -> dict[tuple[str, ...], dict[str, str]]:
     """The rows of runs.csv, by what names their runs."""
-    if not (DATA / "runs.csv").exists():
-        return {}
-    with (DATA / "runs.csv").open(newline="") as file:
-        return {tuple(row[key] for key in IDENTITY): row for row in csv.DictReader(file)}
+    return {tuple(row[key] for key in IDENTITY): row for row in read(DATA / "runs.csv")}
 
 
 def known(task: Task) -> tuple[str, ...]:
@@ -165,12 +162,8 @@ def rows(runs: Path) -> Iterator[dict[str, object]]:
 
 def collect(runs: Path) -> None:
     """Write runs.csv, the curves, and the maps for the pictures."""
-    DATA.mkdir(exist_ok=True)
     found = list(rows(runs))
-    with atomic_path(DATA / "runs.csv") as path, path.open("w", newline="") as file:
-        table = csv.DictWriter(file, list(found[0]), lineterminator="\n")
-        table.writeheader()
-        table.writerows(found)
+    write(found, DATA / "runs.csv")
     for task in tasks():
         if not finished(runs, task):
             continue
