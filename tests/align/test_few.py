@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 from helpers.misaligned_balls import MATERIAL, scan_of
 from holosplat.align import PoseOptions, Uncertain, align_views
 from holosplat.align.derivatives import projections
-from holosplat.align.following import SHARP, SOFT, Following, of_poses
-from holosplat.align.marginal_likelihood import weighed
+from holosplat.align.marginal_likelihood import SHARP, SOFT, Following, of_poses, weighed
 from holosplat.align.null_space import beside, motions
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.geometry import Grid, Views

@@ -13,7 +13,7 @@ from holosplat.align.fixed_matter import Beside
 from holosplat.align.marginal_likelihood import _larger
 from holosplat.align.null_space import beside, motions
 from holosplat.align.poses import PoseOptions, PoseSearch, Uncertain
-from holosplat.align.rehearsal import Searched, rehearsed, with_random_phases
+from holosplat.align.views import Searched, rehearsed, with_random_phases
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.geometry import Grid
 from holosplat.matter import Matter

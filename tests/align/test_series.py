@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from helpers.misaligned_balls import MATERIAL, PIXEL
 from helpers.moving_balls import beams, series
 from holosplat.align import AlignedBeams, Drift, PoseOptions, Uncertain, align_views
-from holosplat.align.beams import DRIFT, LINEAR, STAY
 from holosplat.align.derivatives import NUMBERS
+from holosplat.align.find import DRIFT, LINEAR, STAY
 from holosplat.align.gauge import moved_onto
 from holosplat.align.newton import Normal
 from holosplat.align.series_search import Beams, Moment, SeriesSearch, chosen_moments

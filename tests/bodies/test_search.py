@@ -9,9 +9,8 @@ import pytest
 
 from helpers.motion_shadows import FLOW, OTHER, TURN, cell, pose, shadows
 from holosplat.bodies import neighbourhood_search
-from holosplat.bodies.neighbourhood_search import pursued
+from holosplat.bodies.neighbourhood_search import exchanged, pursued
 from holosplat.bodies.poses import Explained, Pose
-from holosplat.bodies.pursuit import exchanged
 from holosplat.bodies.search import best_size
 from holosplat.bodies.templates import Search, Templates
 from holosplat.fit.running import Steps

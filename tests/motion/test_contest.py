@@ -14,9 +14,8 @@ from helpers.moving_ellipsoids import MATERIAL, scan, true_paths
 from holosplat.checks import InputError
 from holosplat.inference import Decision, Score
 from holosplat.learning.weights import Card, Trained
-from holosplat.motion import body_tracker, model_comparison
-from holosplat.motion.model_comparison import NAME, Parts, compared_kinds, unexplained
-from holosplat.motion.track import TrackOptions, follow
+from holosplat.motion import body_tracker, track
+from holosplat.motion.track import NAME, Parts, TrackOptions, compared_kinds, follow, unexplained
 
 
 class Run:
@@ -47,7 +46,7 @@ class Run:
 )
 def test_what_leaves_less_is_kept(monkeypatch, cells, other, kept, looked):
     spread = 1 + 0.05 * np.random.default_rng(0).normal(size=(40, 3))
-    monkeypatch.setattr(model_comparison, "unexplained", lambda run: Score(run.left**2 * spread))
+    monkeypatch.setattr(track, "unexplained", lambda run: Score(run.left**2 * spread))
     runs = Run("cells", cells or 0.0, cells is None), Run("other", other)
     said = compared_kinds(*runs)  # type: ignore[arg-type]
     assert said.startswith(kept)

@@ -89,7 +89,7 @@ class SlurmFlags(Slurm):
 
     def carry_out(self, folder: SeriesFolder, retry: bool) -> None:
         """Write the script, and submit it if that is asked for."""
-        from ..series.clusters import submit, write_script
+        from ..series.run import submit, write_script
 
         count, numbers = write_script(folder, self, retry)
         _say(f"wrote {folder.script} for {count} task(s): {numbers}")
@@ -180,7 +180,7 @@ def run(
         elif task is not None:
             counts = counted([run_task(series, task, _tell_row)])
         elif dask is not None:
-            from ..series.clusters import run_on_dask
+            from ..series.run import run_on_dask
 
             counts = run_on_dask(series, dask, retry, lambda state: _say(f"task {state.number}: {state.state}"))
         elif jobs:

@@ -1,4 +1,3 @@
-from .blast import Blast as Blast
 from .capsules import Capsule as Capsule
 from .capsules import place_capsules as place_capsules
 from .carried import CarriedScene as CarriedScene
@@ -12,6 +11,7 @@ from .drawn import Drawn as Drawn
 from .drawn import Substances as Substances
 from .flow.suspension import Medium as Medium
 from .flow.suspension import Suspension as Suspension
+from .fluids import Blast as Blast
 from .fluids import BreakUp as BreakUp
 from .fluids import Bubbles as Bubbles
 from .fluids import Cuvette as Cuvette

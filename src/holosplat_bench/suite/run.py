@@ -5,9 +5,13 @@ from __future__ import annotations
 import gc
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Protocol, cast, runtime_checkable
+
+import numpy as np
 
 from holosplat.backends import resolve
 from holosplat.beamline.declared.case import Case
@@ -17,6 +21,7 @@ from holosplat.optics.sampling import fringe_sampling
 from holosplat.progress import Progress
 from holosplat.representations import Stored
 from holosplat.scan import Scan
+from holosplat.specimens.phantoms import Ball
 from holosplat.version import source_commit
 from holosplat.volume import Object, Volume
 from holosplat.workflows.evaluate import Scores, score_object
@@ -29,10 +34,67 @@ from .method import Method
 from .moved import judged_with
 from .pictures import TRUTH, Arrays, method_picture, truth_picture
 from .prepare import prepared
-from .record import memory_growth
 from .references import Reference
 from .rows import REFERENCE, Row
-from .sizes import contrast_by_size
+
+HALF_DIAGONAL = 0.5 * np.sqrt(3.0)
+"""From a voxel's centre to its corner, in voxels: a ball of this radius holds a voxel's centre wherever it lies."""
+
+
+def contrast_by_size(found: Volume, truth: Volume, balls: Sequence[Ball]) -> tuple[np.ndarray, np.ndarray]:
+    """Diameters [S] [m], falling, and the contrast [S] of the balls of each, as a part of the true one.
+
+    A ball's contrast is the mean δ within it, less the mean δ in the shell around it as wide as its radius; both
+    volumes lie on one grid of cubic voxels. 1: all of it is left; 0: nothing is seen.
+    """
+    contrast = np.array([[_contrast(volume, ball) for volume in (found, truth)] for ball in balls])
+    diameters = np.array([ball.diameter for ball in balls])
+    sizes = np.unique(diameters)[::-1]
+    sums = np.stack([contrast[diameters == size].sum(axis=0) for size in sizes])
+    return sizes, sums[:, 0] / sums[:, 1]
+
+
+def _contrast(volume: Volume, ball: Ball) -> float:
+    """Mean δ in `ball` less that around it; with room for the blur of a voxel between the two."""
+    pitch, radius = volume.grid.voxel_size[0], 0.5 * ball.diameter
+    reach = max(2 * radius, radius + 1.5 * pitch)
+    near = [np.flatnonzero(np.abs(axis - c) <= reach) for axis, c in zip(volume.grid.axes(), ball.centre)]
+    x, y, z = (axis[i] - c for axis, i, c in zip(volume.grid.axes(), near, ball.centre))
+    distance = np.sqrt(z[:, None, None] ** 2 + y[None, :, None] ** 2 + x[None, None, :] ** 2)
+    values = volume.delta[np.ix_(near[2], near[1], near[0])].astype(np.float64)
+    inside = distance <= max(radius, HALF_DIAGONAL * pitch)
+    around = (distance > radius + 0.5 * pitch) & (distance <= reach)
+    return float(values[inside].mean() - values[around].mean())
+
+
+STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+RESET_PEAK = "5"
+"""What Linux takes to forget the peak of a process's memory (proc(5), clear_refs)."""
+
+
+@contextmanager
+def memory_growth() -> Iterator[Callable[[], int | None]]:
+    """Yields a function: by how many bytes the process's memory grew at its peak since; None where Linux is not."""
+    before = None
+    with suppress(OSError):
+        CLEAR.write_text(RESET_PEAK)
+        before = _status("VmRSS")
+
+    def growth() -> int | None:
+        peak = _status("VmHWM")
+        return None if before is None or peak is None else max(0, peak - before)
+
+    yield growth
+
+
+def _status(key: str) -> int | None:
+    """An entry of /proc/self/status [bytes]."""
+    try:
+        lines = STATUS.read_text(encoding="ascii", errors="replace").splitlines()
+        return 1024 * next(int(line.split()[1]) for line in lines if line.startswith(key + ":"))
+    except (OSError, StopIteration):
+        return None
+
 
 TRUTH_THRESHOLD = 0.5
 """Shell correlation with a noise-free truth at which the resolution is read: 0.143 between two halves of the data
