@@ -12,8 +12,7 @@ from pathlib import Path
 
 from rows import read, write
 
-from holosplat_bench.suite.folder import BenchFolder
-from holosplat_bench.suite.rows import read_row
+from holosplat_bench.suite.folder import BenchFolder, read_row
 
 COMMITTED = Path(__file__).parents[1] / "docs" / "data" / "benchmark.csv"
 SCORES = ("ssim", "frcm", "dice", "relative_error_delta")

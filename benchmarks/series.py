@@ -55,9 +55,8 @@ from holosplat.mesh import TriangleMesh
 from holosplat.methods import Method
 from holosplat.methods.presets import preset
 from holosplat.metrics import volume_scores
-from holosplat.series.folder import SeriesFolder
+from holosplat.series.folder import Row, SeriesFolder
 from holosplat.series.plan import plan_series
-from holosplat.series.rows import Row
 from holosplat.series.run import PROGRAM, states
 from holosplat.series.settings import Cut, Settings, Warm
 from holosplat.series.task import run_task

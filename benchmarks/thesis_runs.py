@@ -30,9 +30,8 @@ import numpy as np
 from rows import read, write
 
 from holosplat.io.atomic import atomic_path
-from holosplat_bench.thesis.configurations import BESIDE, DECLARED, EVERY, EXTRA, PACES, THESIS_TABLE
+from holosplat_bench.thesis.configurations import BESIDE, DECLARED, EVERY, EXTRA, PACES, PHYSICS, THESIS_TABLE
 from holosplat_bench.thesis.folder import CURVES, StudyFolder
-from holosplat_bench.thesis.measured import PHYSICS
 
 DATA = Path(__file__).resolve().parents[1] / "docs" / "data" / "thesis_study"
 SMALL = [c.name for c in THESIS_TABLE if c.count == THESIS_TABLE[0].count]

@@ -20,7 +20,7 @@ from rows import written
 from holosplat.beamline.declared.case import Case
 from holosplat.model import Instrument
 from holosplat_bench.suite.case import load_case
-from holosplat_bench.thesis.measured import PHYSICS
+from holosplat_bench.thesis.configurations import PHYSICS
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "data" / "thesis_study" / "sampling.csv"
 SAMPLES, FINEST = (1, 2, 3, 4, 6, 8), 12

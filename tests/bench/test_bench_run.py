@@ -21,10 +21,9 @@ from holosplat.representations.voxels import VoxelGrid
 from holosplat.specimens.phantoms import star_of_balls
 from holosplat.workflows.evaluate import score_object
 from holosplat_bench.suite import references, run
-from holosplat_bench.suite.folder import BenchFolder
+from holosplat_bench.suite.folder import BenchFolder, Row, read_row, write_row
 from holosplat_bench.suite.prepare import fingerprint, prepared
 from holosplat_bench.suite.references import REFERENCES
-from holosplat_bench.suite.rows import Row, read_row, write_row
 from holosplat_bench.suite.run import Suite, contrast_by_size, run_suite
 
 pytestmark = pytest.mark.usefixtures("unjudged_runs")

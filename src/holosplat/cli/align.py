@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -203,7 +202,7 @@ def _write_geometry(
 
 def _write_table(path: Path, found: AlignedViews) -> None:
     """A row for each view."""
-    from ..io.atomic import atomic_path
+    from ..io.atomic import write_rows
 
     names = (
         "shift_x_px",
@@ -215,12 +214,11 @@ def _write_table(path: Path, found: AlignedViews) -> None:
         "magnification_share",
     )
     header = ["view", *names, *(f"error_{name}" for name in names), "flux", "before", "after"]
-    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(header)
-        for v in range(len(found.changes)):
-            last = (found.flux[v], found.before[v], found.after[v])
-            writer.writerow([v, *(f"{value:.6g}" for value in (*found.changes[v], *found.errors[v], *last))])
+    last = zip(found.flux, found.before, found.after)
+    rows = (
+        [v, *(f"{value:.6g}" for value in (*found.changes[v], *found.errors[v], *ends))] for v, ends in enumerate(last)
+    )
+    write_rows(path, header, rows)
 
 
 def _ratio(prior: MaterialPrior) -> float | None:

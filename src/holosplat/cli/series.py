@@ -20,8 +20,7 @@ from .places import Output, with_checked_arguments
 from .progress import INTERRUPTED
 
 if TYPE_CHECKING:
-    from ..series.folder import SeriesFolder
-    from ..series.rows import Row
+    from ..series.folder import Row, SeriesFolder
     from ..series.run import Counts
     from ..series.settings import Settings
 
@@ -194,7 +193,7 @@ def run(
 
 
 def _tell_row(row: Row) -> None:
-    from ..series.rows import line_of
+    from ..series.folder import line_of
 
     _say(line_of(row))
 
@@ -231,8 +230,7 @@ def collect(folder: Positional[Path]) -> None:
         folder: Folder of the series.
     """
     from ..series.collect import collect as join
-    from ..series.folder import SeriesFolder
-    from ..series.rows import some
+    from ..series.folder import SeriesFolder, some
 
     found = join(series := SeriesFolder(folder))
     for path in (series.table, series.bodies, series.page):

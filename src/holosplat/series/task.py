@@ -24,9 +24,8 @@ from ..workflows.evaluate import Evaluation, evaluate
 from ..workflows.reconstruction import Reconstruction
 from ..workflows.run_folder import RunFolder, claimed
 from ..workflows.track import track
-from .folder import DONE, FAILED, SeriesFolder, TaskState
+from .folder import DONE, FAILED, Row, SeriesFolder, TaskState, read_row, write_row
 from .plan import Moment, SeriesPlan, Source, Window, at, fingerprint
-from .rows import Row, read_row, write_row
 from .time import PHASE, Before, Shot, reconstruct_time, write_phase
 
 Told = Callable[[Row], None]

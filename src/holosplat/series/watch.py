@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import os
 import socket
 import time
@@ -12,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ..checks import as_written, require
-from ..io.atomic import atomic_path
+from ..io.atomic import write_rows
 from ..io.folder import is_taken, require_parent
 from ..io.formats import read_frames
 from ..io.json import read_json, write_json
@@ -24,8 +23,8 @@ from ..ranges import Positive, Seconds, ranged
 from ..scan import Scan
 from ..workflows.run_folder import RunFolder
 from .appearing import Folder, Found
+from .folder import ROW, Row, plain, read_row, write_row
 from .plan import at, times_of
-from .rows import ROW, Row, plain, read_row, write_row
 from .settings import Settings
 from .task import attempted
 from .time import PHASE, Before, Shot, reconstruct_time
@@ -285,10 +284,7 @@ class Watch:
         from .page import Frame, SeriesPage, headline, write_page  # which need matplotlib
 
         self._said = self.clock()
-        with atomic_path(self.folder.table) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(COLUMNS)
-            writer.writerows(self._line(row, run) for row, run in self._times)
+        write_rows(self.folder.table, COLUMNS, (self._line(row, run) for row, run in self._times))
         frames = tuple(Frame(row, row.time_s, run / PHASE, self._relative(run)) for row, run in self._times if row.done)
         bad = [row for row, _ in self._times if not row.done]
         failed = {f"{plain(Path(row.scan).name)}, time {row.frame}": plain(row.reason) for row in bad}

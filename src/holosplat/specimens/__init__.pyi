@@ -2,6 +2,8 @@ from .capsules import Capsule as Capsule
 from .capsules import place_capsules as place_capsules
 from .carried import CarriedScene as CarriedScene
 from .carried import Twist as Twist
+from .carried import collapsing_foam as collapsing_foam
+from .carried import stirred_blob as stirred_blob
 from .continuous import Bump as Bump
 from .continuous import ContinuousScene as ContinuousScene
 from .continuous import Element as Element
@@ -42,8 +44,6 @@ from .soft_matter import round_cell as round_cell
 from .soft_matter import shepp_logan as shepp_logan
 from .soft_matter import soft_cells as soft_cells
 from .soft_matter import tissue as tissue
-from .soft_motion import collapsing_foam as collapsing_foam
-from .soft_motion import stirred_blob as stirred_blob
 from .solids import Channel as Channel
 from .solids import Crack as Crack
 from .solids import Fibres as Fibres

@@ -18,8 +18,8 @@ from holosplat.cli.room import tell
 from holosplat.ranges import Seed
 
 if TYPE_CHECKING:
+    from ..suite.folder import Row
     from ..suite.method import Method
-    from ..suite.rows import Row
     from ..suite.run import Suite
     from ..thesis.folder import StudyFolder
 
@@ -49,10 +49,9 @@ def thesis(
     from holosplat.io.lock import sole_writer
 
     from ..suite.case import load_case
-    from ..thesis.configurations import PACES
+    from ..thesis.configurations import PACES, Measured
     from ..thesis.configurations import configurations as named
     from ..thesis.folder import StudyFolder
-    from ..thesis.measured import Measured
     from ..thesis.study import run_study
 
     chosen, folder, interrupted = named(configurations), StudyFolder(out), False

@@ -22,8 +22,7 @@ from holosplat.methods.per_view import SVMBIR
 from holosplat.methods.presets import preset
 
 from ..opponents.photographs import AlphaSplats, RadianceFields
-from .aligners import ALIGNERS
-from .method import Method
+from .method import ALIGNERS, Method
 
 PER_VIEW = "phase retrieval of each view, then tomography"
 VOXELS = "voxels through the waves"

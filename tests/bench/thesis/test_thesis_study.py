@@ -16,10 +16,9 @@ from holosplat_bench.cli import bench as command
 from holosplat_bench.suite import case as bench_case
 from holosplat_bench.suite.pages.page import as_markdown, escaped
 from holosplat_bench.thesis import study as thesis_study
-from holosplat_bench.thesis.configurations import EVERY, PACES, THESIS_TABLE, Pace
+from holosplat_bench.thesis.configurations import EVERY, PACES, THESIS_TABLE, Measured, Pace
 from holosplat_bench.thesis.findings import findings
 from holosplat_bench.thesis.folder import CURVES, StudyFolder, load_study
-from holosplat_bench.thesis.measured import Measured
 from holosplat_bench.thesis.pages import page as report
 from holosplat_bench.thesis.pages.page import LINES, PICTURES, page_of, pictures, write_study
 from holosplat_bench.thesis.study import run_study

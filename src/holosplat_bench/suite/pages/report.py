@@ -12,9 +12,8 @@ from holosplat.checks import require
 from holosplat.report.style import format_length, scientific
 from holosplat.report.tables import Headline, duration
 
-from ..folder import BenchFolder
+from ..folder import BenchFolder, Row
 from ..pictures import TRUTH
-from ..rows import Row
 from .page import Entry, Page, Picture, ScoreTable, Sheet, write_page
 from .pictures import Shown, holograms_figure, slices_figure
 from .plots import SMALLEST, Marks, curves_figure, marks_of, overview_figure, sizes_figure, tradeoff_figure
