@@ -23,7 +23,7 @@ from rows import merge
 from scipy.spatial.transform import Rotation
 
 import holosplat as hs
-from holosplat.align import PoseOptions, Uncertain, align_views
+from holosplat.align import PoseOptions, PosePrior, align_views
 from holosplat.align.gauge import moved_onto
 from holosplat.beamline.declared.case import Case
 from holosplat.beamline.misalignment import Misalignment
@@ -32,7 +32,7 @@ from holosplat.metrics import volume_scores
 from holosplat.version import source_commit
 from holosplat_bench.suite.case import load_case
 
-USUAL = Uncertain()
+USUAL = PosePrior()
 MOMENTS = ("planned", "aligned", "refined", "true")
 FINE = str(Path(__file__).with_name("alignment_fine.toml"))
 """Red cells whose first fringe is 2.5 pixels wide."""
@@ -71,11 +71,11 @@ class Experiment:
     scene: str
     errors: Misalignment
     photons: float | None = None
-    uncertain: Uncertain = USUAL
+    uncertain: PosePrior = USUAL
     held_out: int = 4
     methods: tuple[str, ...] = ()
 
-    def told(self) -> Uncertain:
+    def told(self) -> PosePrior:
         """What `align` is told: distances are as uncertain as they are, and 2 % where all is as planned."""
         return replace(self.uncertain, distance=self.errors.distance or 0.02)
 
@@ -90,7 +90,7 @@ CASES = {
     "1 px, 0.6°": Experiment("main12", Misalignment(1.0, 0.6, 0.02, 0)),
     "1 px, 0.6°, other errors": Experiment("main12", Misalignment(1.0, 0.6, 0.02, 1)),
     "1 px, 0.6°, 4 views": Experiment("main4", Misalignment(1.0, 0.6, 0.02, 0)),
-    "5 px, 1°, 2000 photons": Experiment("main12", Misalignment(5.0, 1.0, 0.05, 1), 2000.0, Uncertain(shift=5.0)),
+    "5 px, 1°, 2000 photons": Experiment("main12", Misalignment(5.0, 1.0, 0.05, 1), 2000.0, PosePrior(shift=5.0)),
     "perfect": Experiment("main12", Misalignment()),
     "perfect, 12 views": Experiment("main12", Misalignment(seed=7), methods=("gaussians",)),
     "perfect, 4 views": Experiment("main4", Misalignment(seed=7), held_out=2, methods=("gaussians",)),
@@ -98,12 +98,12 @@ CASES = {
     "fine pixels, 2000 photons": Experiment(FINE, Misalignment(1.0, 0.6, 0.02, 3), 2000.0),
     "soft cells": Experiment("soft12", Misalignment(1.0, 0.6, 0.02, 4)),
     "1 px, 0.6°, 1 % magnification": Experiment(
-        "main12", Misalignment(1.0, 0.6, 0.0, 0, magnification=0.01), uncertain=Uncertain(magnification=0.01)
+        "main12", Misalignment(1.0, 0.6, 0.0, 0, magnification=0.01), uncertain=PosePrior(magnification=0.01)
     ),
     "1 px, 0.6°, 0.5 % magnification": Experiment(
-        "main12", Misalignment(1.0, 0.6, 0.0, 1, magnification=0.005), uncertain=Uncertain(magnification=0.01)
+        "main12", Misalignment(1.0, 0.6, 0.0, 1, magnification=0.005), uncertain=PosePrior(magnification=0.01)
     ),
-    "perfect, magnification free": Experiment("main12", Misalignment(), uncertain=Uncertain(magnification=0.01)),
+    "perfect, magnification free": Experiment("main12", Misalignment(), uncertain=PosePrior(magnification=0.01)),
     "volume 12": Experiment("main12", Misalignment(1.0, 0.6, 0.02, 7), methods=BOTH),
     "volume 12, other errors": Experiment("main12", Misalignment(1.0, 0.6, 0.02, 8), methods=("auto",)),
     "volume 4": Experiment("main4", Misalignment(1.0, 0.6, 0.02, 7), held_out=2, methods=BOTH),

@@ -8,5 +8,5 @@ from .find import AlignedBeams as AlignedBeams
 from .find import align_views as align_views
 from .poses import Drift as Drift
 from .poses import PoseOptions as PoseOptions
-from .poses import Uncertain as Uncertain
+from .poses import PosePrior as PosePrior
 from .views import AlignedViews as AlignedViews

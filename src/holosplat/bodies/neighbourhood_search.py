@@ -13,7 +13,7 @@ from ..fit.running import Steps
 from ..mesh import TriangleMesh
 from .poses import FREER, Explained, Pose
 from .shadows import Shadows
-from .templates import Hit, Search, Templates
+from .templates import Hit, Templates, TemplateSearch
 
 LEAST, ALSO = 0.35, 0.8
 """Share of what its shadow is worth by which a body must explain the frames; and share of the best one's from which on
@@ -27,7 +27,7 @@ SAME_HEIGHT = 1.0
 MOST_PURSUED = 60
 
 
-def searched(every: Explained, search: Search, begun: list[Pose]) -> list[Pose]:
+def searched(every: Explained, search: TemplateSearch, begun: list[Pose]) -> list[Pose]:
     """`begun` and what is found beside them, without those that explain nothing."""
     found = _add_bodies(every, search, explaining(every, begun))
     return explaining(every, exchanged(every, search, every.improved(found, LAST_STEPS)))
@@ -38,7 +38,7 @@ def explaining(every: Explained, found: Sequence[Pose]) -> list[Pose]:
     return [pose for pose, share in zip(found, every.shares(found)) if share >= LEAST]
 
 
-def _add_bodies(every: Explained, search: Search, found: list[Pose]) -> list[Pose]:
+def _add_bodies(every: Explained, search: TemplateSearch, found: list[Pose]) -> list[Pose]:
     """`found`, and those that explain what these leave, one round after the other."""
     left = every.without(found)
     for _ in range(MOST_PURSUED):
@@ -56,7 +56,7 @@ def _add_bodies(every: Explained, search: Search, found: list[Pose]) -> list[Pos
 
 
 def candidates(
-    left: Explained, search: Search, most: int, without: Sequence[np.ndarray] = ()
+    left: Explained, search: TemplateSearch, most: int, without: Sequence[np.ndarray] = ()
 ) -> list[tuple[float, Pose]]:
     """Bodies that explain enough of what is left, with their shares, the best first; none begins near `without`."""
     hits = [_pose_of(hit) for hit in search.tops(left.seen, most, without)]
@@ -69,7 +69,7 @@ def _pose_of(hit: Hit) -> Pose:
     return Pose(hit.matrix, hit.centre, hit.velocity, np.zeros(3))
 
 
-def exchanged(every: Explained, search: Search, found: list[Pose]) -> list[Pose]:
+def exchanged(every: Explained, search: TemplateSearch, found: list[Pose]) -> list[Pose]:
     """The same bodies, pairs of which have exchanged what two beams show of them where that explains more.
 
     Two beams see two bodies at one height as they would see two others, each in the shadow of the one in the first
@@ -89,7 +89,7 @@ def exchanged(every: Explained, search: Search, found: list[Pose]) -> list[Pose]
     return every.improved(found, STEPS)
 
 
-def two_beams(search: Search) -> bool:
+def two_beams(search: TemplateSearch) -> bool:
     """Whether frames are of two directions."""
     return len(np.unique(search.templates.directions)) == 2
 
@@ -102,7 +102,7 @@ def level_pairs(every: Explained, found: Sequence[Pose]) -> list[tuple[int, int]
     return [(i, j) for i in range(len(found)) for j in range(i) if abs(levels[i] - levels[j]) <= least]
 
 
-def swapped(every: Explained, search: Search, found: Sequence[Pose], i: int, j: int) -> list[Pose]:
+def swapped(every: Explained, search: TemplateSearch, found: Sequence[Pose], i: int, j: int) -> list[Pose]:
     """Exchange the shadows of bodies `i` and `j` in the second of two beams."""
     first, second = (every.seen.rotations[n, :2].numpy() for n in _directions(every))
     left = every.without([pose for k, pose in enumerate(found) if k not in (i, j)])
@@ -222,7 +222,7 @@ def pursued(
     done.
     """
     steps = steps or Steps()
-    search, every = Search(Templates.of(mesh, seen), seen, velocities), Explained(mesh, seen, steps=steps)
+    search, every = TemplateSearch(Templates.of(mesh, seen), seen, velocities), Explained(mesh, seen, steps=steps)
     free = Explained(mesh, seen, FREER, steps)
     starts = [[], every.improved(begun, LAST_STEPS)] if begun else [[]]
     found = [free.improved(searched(every, search, start), LAST_STEPS) for start in starts]
@@ -241,7 +241,7 @@ class NeighbourhoodSearch:
     """
 
     every: Explained
-    search: Search
+    search: TemplateSearch
     seed: int = 0
 
     def __post_init__(self) -> None:

@@ -55,10 +55,10 @@ class UncertainOptions:
 
     def options(self) -> PoseOptions:
         """The options of the search."""
-        from ..align import Drift, PoseOptions, Uncertain
+        from ..align import Drift, PoseOptions, PosePrior
 
         sizes = {name.removeprefix("uncertain_"): value for name, value in vars(self).items() if "drift" not in name}
-        return PoseOptions(Uncertain(**sizes), drift=Drift(self.drift_shift, self.drift_angle))
+        return PoseOptions(PosePrior(**sizes), drift=Drift(self.drift_shift, self.drift_angle))
 
 
 @dataclass(frozen=True)
@@ -88,10 +88,10 @@ class RefineOptions:
             changed = [name.replace("_", "-") for name, value in vars(self).items() if value != usual[name]]
             require(not changed, f"--{', --'.join(changed)} go with --refine, which says what is uncertain; add it.")
             return None
-        from ..align import PoseOptions, Uncertain
+        from ..align import PoseOptions, PosePrior
         from ..align.geometry import wanted
 
-        return PoseOptions(wanted(self.refine, Uncertain(**sizes)))
+        return PoseOptions(wanted(self.refine, PosePrior(**sizes)))
 
 
 def align(

@@ -24,41 +24,21 @@ from .track_options import TrackOptions
 NAME, CELLS, ANY = "shape of the bodies", "red cells", "any shape"
 
 
-class Parts:
-    """A journal of several followings, each by its name."""
+class NamedJournal:
+    """The journal of one of several runs, by its name."""
 
-    def __init__(self, journal: Journal) -> None:
-        self._journal = journal
-        with as_written("checkpoint.pt", "a checkpoint of this run"):
-            self._states = dict[str, Mapping[str, Any]](journal.load() or {})
-
-    def of(self, name: str) -> Part:
-        """The journal of one of them."""
-        return Part(self, name)
-
-    def load(self, name: str) -> Mapping[str, Any] | None:
-        """Load the last saved state of one of them."""
-        return self._states.get(name)
-
-    def save(self, name: str, state: Mapping[str, Any]) -> None:
-        """Keep it, beside those of the others."""
-        self._states[name] = state
-        self._journal.save(self._states)
-
-
-class Part:
-    """The journal of one following of several."""
-
-    def __init__(self, parts: Parts, name: str) -> None:
-        self._parts, self._name = parts, name
+    def __init__(self, journal: Journal, states: dict[str, Mapping[str, Any]], name: str) -> None:
+        """states: of all of them, which `journal` keeps together."""
+        self._journal, self._states, self._name = journal, states, name
 
     def load(self) -> Mapping[str, Any] | None:
         """Load the last saved state; None at the beginning."""
-        return self._parts.load(self._name)
+        return self._states.get(self._name)
 
     def save(self, state: Mapping[str, Any]) -> None:
-        """Keep it."""
-        self._parts.save(self._name, state)
+        """Keep it, beside those of the others."""
+        self._states[self._name] = state
+        self._journal.save(self._states)
 
 
 def compared_kinds(cells: BodyTracker, other: BodyTracker) -> Followed:
@@ -119,10 +99,13 @@ def follow(
     """
     train = scan.train()
     require_times(train)
-    parts = Parts(journal)
+    with as_written("checkpoint.pt", "a checkpoint of this run"):
+        states = dict[str, Mapping[str, Any]](journal.load() or {})
 
     def following(name: str, body: KnownBody | None) -> BodyTracker:
-        run = BodyTracker(train, material, replace(options, body=body), seed, light, parts.of(name), on_progress)
+        run = BodyTracker(
+            train, material, replace(options, body=body), seed, light, NamedJournal(journal, states, name), on_progress
+        )
         run.take_up()
         return run
 

@@ -16,7 +16,7 @@ from ..io.atomic import atomic_path
 from ..io.lock import TakenError
 from .folder import FAILED, SeriesFolder, TaskState, cores
 from .settings import Slurm
-from .task import Told, nothing, run_task
+from .task import OnRow, nothing, run_task
 
 MOST_SECONDS = 60
 """How long sbatch may take [s]."""
@@ -189,7 +189,7 @@ def states(folder: SeriesFolder) -> list[TaskState]:
 def run_left(
     folder: SeriesFolder,
     retry: bool = False,
-    on_row: Told = nothing,
+    on_row: OnRow = nothing,
     on_task: Callable[[TaskState], None] = lambda state: None,
     among: Container[int] | None = None,
 ) -> Counts:

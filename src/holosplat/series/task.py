@@ -28,7 +28,7 @@ from .folder import DONE, FAILED, Row, SeriesFolder, TaskState, read_row, write_
 from .plan import Moment, SeriesPlan, Source, Window, at, fingerprint
 from .time import PHASE, Before, Shot, reconstruct_time, write_phase
 
-Told = Callable[[Row], None]
+OnRow = Callable[[Row], None]
 """Called with every row that is written."""
 
 
@@ -36,7 +36,7 @@ def nothing(row: Row) -> None:
     """Nobody wants to know."""
 
 
-def run_task(folder: SeriesFolder, number: int, on_row: Told = nothing) -> TaskState:
+def run_task(folder: SeriesFolder, number: int, on_row: OnRow = nothing) -> TaskState:
     """Do the rest of a task, and return its progress.
 
     Every time has its run folder and its row, written whole: after a kill, the task goes on in the middle of the time
@@ -62,7 +62,7 @@ def run_task(folder: SeriesFolder, number: int, on_row: Told = nothing) -> TaskS
     return folder.state(window)
 
 
-def _work(folder: SeriesFolder, plan: SeriesPlan, window: Window, on_row: Told) -> str:
+def _work(folder: SeriesFolder, plan: SeriesPlan, window: Window, on_row: OnRow) -> str:
     """Do the times; why not all of them could be, or nothing."""
     scans = Scans(plan)
     if plan.settings.act == "track":

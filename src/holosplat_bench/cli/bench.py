@@ -19,7 +19,7 @@ from holosplat.ranges import Seed
 
 if TYPE_CHECKING:
     from ..suite.folder import Row
-    from ..suite.method import Method
+    from ..suite.method import BenchMethod
     from ..suite.run import Suite
     from ..thesis.folder import StudyFolder
 
@@ -243,7 +243,7 @@ def _tell(sources: Mapping[str, str], suite: Suite, folders: Folders, out: Path)
         tell("the benchmark", of_benchmark(list(each.values())), out, others)
 
 
-def _list(cases: list[str], methods: Mapping[str, Method]) -> None:
+def _list(cases: list[str], methods: Mapping[str, BenchMethod]) -> None:
     print("cases:", *cases, sep="\n  ")
     print("methods:")
     for name, method in methods.items():

@@ -94,7 +94,7 @@ def _registered(lines: Tensor, volume: Tensor, grid: Grid, views: Views) -> View
 
 
 @dataclass(frozen=True)
-class Method:
+class BenchMethod:
     """name: for the command line and the table; family: its heading in the table; summary: one line of what it does;
     options: of the library's method that runs; aligner: what first finds where the beams are (None: nothing)."""
 

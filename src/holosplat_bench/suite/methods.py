@@ -22,7 +22,7 @@ from holosplat.methods.per_view import SVMBIR
 from holosplat.methods.presets import preset
 
 from ..opponents.photographs import AlphaSplats, RadianceFields
-from .method import ALIGNERS, Method
+from .method import ALIGNERS, BenchMethod
 
 PER_VIEW = "phase retrieval of each view, then tomography"
 VOXELS = "voxels through the waves"
@@ -34,13 +34,13 @@ PHOTOGRAPHS = "holograms taken for photographs, without waves"
 AUTO = "chosen by the frames"
 
 
-def methods(effort: float = 1.0) -> dict[str, Method]:
+def methods(effort: float = 1.0) -> dict[str, BenchMethod]:
     """Name → method. effort: share of the steps of those that fit in many steps (1: as published)."""
     table = (*_as_photographs(effort), *_per_view(), *_through_waves(effort))
     return {method.name: method for method in table}
 
 
-def _per_view() -> list[Method]:
+def _per_view() -> list[BenchMethod]:
     """Paganin with every tomography, then every other phase retrieval with the best of them."""
     plain = {
         "fbp": "filtered back-projection",
@@ -62,19 +62,19 @@ def _per_view() -> list[Method]:
         "admm": "ADMM",
     }
     rows += [(f"{name}-tv", f"{what}, total variation in [0, 1]", PerView(name, "tv")) for name, what in others.items()]
-    return [Method(name, PER_VIEW, summary, options) for name, summary, options in rows]
+    return [BenchMethod(name, PER_VIEW, summary, options) for name, summary, options in rows]
 
 
-def _as_photographs(effort: float) -> list[Method]:
+def _as_photographs(effort: float) -> list[BenchMethod]:
     """Both from a random start."""
     splats, field = AlphaSplats().with_effort(effort), RadianceFields().with_effort(effort)
     return [
-        Method(splats.kind, PHOTOGRAPHS, "opaque Gaussians laid over each other (Kerbl et al. 2023)", splats),
-        Method(field.kind, PHOTOGRAPHS, "radiance field with positional encoding (Mildenhall et al. 2020)", field),
+        BenchMethod(splats.kind, PHOTOGRAPHS, "opaque Gaussians laid over each other (Kerbl et al. 2023)", splats),
+        BenchMethod(field.kind, PHOTOGRAPHS, "radiance field with positional encoding (Mildenhall et al. 2020)", field),
     ]
 
 
-def _through_waves(effort: float) -> list[Method]:
+def _through_waves(effort: float) -> list[BenchMethod]:
     rows: list[tuple[str, str, str, Any]] = [
         (
             "holographic-tv",
@@ -143,7 +143,7 @@ def _through_waves(effort: float) -> list[Method]:
             replace(Auto(), gaussians=replace(Auto().gaussians, start="learned")).with_effort(effort),
         ),
     ]
-    return [Method(*row) for row in rows]
+    return [BenchMethod(*row) for row in rows]
 
 
 METHODS = methods()
@@ -156,7 +156,7 @@ ON_ALIGNED = {
 """The methods that also run on views which were aligned before, and how."""
 
 
-def aligned(table: Mapping[str, Method]) -> dict[str, Method]:
+def aligned(table: Mapping[str, BenchMethod]) -> dict[str, BenchMethod]:
     """Name → method of `ON_ALIGNED`, such as `tikhonov-tv+mass`."""
     found = {}
     for name, ways in ON_ALIGNED.items():

@@ -34,7 +34,7 @@ from holosplat.workflows.provenance import environment, scan_hash
 
 from .folder import REFERENCE, BenchFolder, Row, good_name
 from .measured import MeasuredCase, agreement
-from .method import Aligner, Method
+from .method import Aligner, BenchMethod
 from .pictures import TRUTH, Arrays, method_picture, truth_picture
 from .prepare import prepared
 from .references import Reference
@@ -174,7 +174,7 @@ class Suite:
 
     cases: Sequence[str]
     seeds: Sequence[int]
-    methods: Mapping[str, Method]
+    methods: Mapping[str, BenchMethod]
     references: Mapping[str, Reference]
     load: Callable[[str, int], Case | MeasuredCase]
 
@@ -337,7 +337,9 @@ def _of_reference(reference: Reference, bench: _Bench) -> Callable[[Progress], O
     return lambda on_progress: reference.run(bench.case, bench.truth, on_progress)
 
 
-def _of_method(method: Method, train: Scan, case: Case | MeasuredCase, bench: _Bench) -> Callable[[Progress], Object]:
+def _of_method(
+    method: BenchMethod, train: Scan, case: Case | MeasuredCase, bench: _Bench
+) -> Callable[[Progress], Object]:
     def produce(on_progress: Progress) -> Object:
         scan, aligner = train, method.aligner
         if aligner is not None:
