@@ -11,7 +11,7 @@ from helpers.kept import Kept
 from holosplat.checks import InputError
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import SmoothVolume, Task
-from holosplat.motion.flow_reconstruction import FlowOptions, FlowReconstruction, FlowResult
+from holosplat.motion.flow_reconstruction import FlowOptions, FlowResult, FlowSearch
 from holosplat.scan import Exposures, Scan
 
 MATTER = DeltaBeta(8e-7, 8e-10)
@@ -30,7 +30,7 @@ def scan() -> Scan:
 
 
 def found(scan: Scan, journal: Kept) -> FlowResult:
-    search = FlowReconstruction(Task(scan, MaterialPrior.known(MATTER), seed=2), MATTER, QUICK, journal)
+    search = FlowSearch(Task(scan, MaterialPrior.known(MATTER), seed=2), MATTER, QUICK, journal)
     search.take_up()
     return search.run()
 

@@ -52,11 +52,11 @@ class Searched:
     decisions: tuple[Decision, ...] = ()
 
 
-PoseSearch = Callable[[Scan, PoseOptions], Searched]
+ScanSearch = Callable[[Scan, PoseOptions], Searched]
 """The whole search of a scan, from its planned exposures on."""
 
 
-def rehearsed(done: Searched, again: PoseSearch) -> np.ndarray:
+def rehearsed(done: Searched, again: ScanSearch) -> np.ndarray:
     """[V, 7] errors of numbers [pixels, rad, logarithms] of another search, from the same plan on, of frames whose
     matter and poses are those that were found.
 

@@ -122,7 +122,7 @@ class _State:
     fading: Fading | None = None
 
 
-class FlowReconstruction:
+class FlowSearch:
     """The way from frames to matter in motion, step by step; `journal` keeps the last of them."""
 
     def __init__(
