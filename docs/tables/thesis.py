@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,10 @@ from holosplat_bench.thesis.configurations import EVERY, PACES, THESIS_TABLE
 from holosplat_bench.thesis.findings import findings
 from holosplat_bench.thesis.folder import CURVES, Study
 
-from .benchmark import markdown, read
+from .benchmark import TABLES, Table, markdown, read
 from .runs import script
+
+THESIS = "python benchmarks/thesis_runs.py run RUNS --snapshots DIR, then collect RUNS"
 
 DATA = Path(__file__).resolve().parents[1] / "data" / "thesis_study"
 SCHEDULES = {"short": "3 000 steps", "third": "10 000 steps", "full": "30 000 steps"}
@@ -175,3 +178,16 @@ def left() -> str:
         command = " ".join([*first[:at], *(task.name for task in tasks), *first[at + 1 :]])
         lines.append((SCHEDULES[tasks[0].schedule], str(len(tasks)), f"`{command}`"))
     return markdown((f"{len(missing)} runs are left: steps", "runs", "command"), lines)
+
+
+TABLES |= {
+    f"thesis-{name}": Table(make, ("thesis_study/runs.csv",), THESIS, "a day")
+    for name, make in (
+        *((schedule, partial(configurations, schedule)) for schedule in SCHEDULES),
+        ("others", partial(others, "short")),
+        ("others-third", partial(others, "third")),
+        ("others-full", partial(others, "full")),
+        ("findings", verdicts),
+        ("left", left),
+    )
+}
