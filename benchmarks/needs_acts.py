@@ -43,7 +43,7 @@ from holosplat.specimens.red_cells import random_cells
 from holosplat.training.ranges import Ranges
 from holosplat_bench.suite.case import planned_frames
 from holosplat_bench.suite.methods import METHODS as BENCH_METHODS
-from holosplat_bench.suite.needs import of_methods
+from holosplat_bench.suite.methods import of_methods
 
 PIXEL, STEP = 3.2e-6, 1e-4
 """Of frames [m], and between two times [s]."""

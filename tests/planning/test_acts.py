@@ -22,7 +22,7 @@ from holosplat.motion.track_options import TrackOptions
 from holosplat.planning import acts
 from holosplat.planning.needs import Needs, Sizes, coarser, of_fit, of_reconstruction
 from holosplat.scan import Exposures
-from holosplat_bench.suite.needs import of_benchmark, of_methods
+from holosplat_bench.suite.methods import of_benchmark, of_methods
 
 ROOT = Path(__file__).resolve().parents[2]
 TABLE = ROOT / "docs/data/needs_acts.csv"

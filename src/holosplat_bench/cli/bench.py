@@ -229,7 +229,7 @@ def _tell(sources: Mapping[str, str], suite: Suite, folders: Folders, out: Path)
     from holosplat.beamline.simulate import Simulation
 
     from ..suite.case import planned_frames
-    from ..suite.needs import of_benchmark, of_methods
+    from ..suite.methods import of_benchmark, of_methods
 
     methods, each = [method.options for method in suite.methods.values()], {}
     for name, source in sources.items():

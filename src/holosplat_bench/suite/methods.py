@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
+
+import numpy as np
 
 from holosplat.methods import (
     Auto,
     Gaussians,
     HolographicVoxels,
+    Method,
     NeuralFields,
     Onix,
     PerView,
@@ -20,6 +23,8 @@ from holosplat.methods import (
 )
 from holosplat.methods.per_view import SVMBIR
 from holosplat.methods.presets import preset
+from holosplat.planning.needs import Costs, Needs, Sizes, of_fit, of_simulation
+from holosplat.scan import Exposures
 
 from ..opponents.photographs import AlphaSplats, RadianceFields
 from .method import ALIGNERS, BenchMethod
@@ -169,3 +174,23 @@ def aligned(table: Mapping[str, BenchMethod]) -> dict[str, BenchMethod]:
 
 ALIGNED = aligned(METHODS)
 """Methods that are run where they are named, for cases whose beams are not where they should be."""
+
+
+JUDGED = 60.0
+"""Bytes of a voxel of a case whose truth and result are compared (`benchmarks/needs_acts.py`)."""
+
+
+def of_methods(exposures: Exposures, is_test: np.ndarray, samples: int, methods: Sequence[Method]) -> Needs:
+    """What a case of the benchmark takes, with such frames, of which some are held out, and so many wave samples along
+    a pixel of its simulation."""
+    sizes, voxels = Sizes.of(exposures[~is_test]), Sizes.of(exposures).voxels
+    each = [needs for method in methods if (needs := of_fit(sizes, method)) is not None]
+    made = of_simulation(exposures, samples, len(exposures))
+    memory = max([made.memory, *(needs.memory for needs in each)]) + JUDGED * voxels
+    disk = made.disk + 2 * Costs.written * voxels + 1e6 * len(each)
+    return Needs(memory, disk, 10 + sum(needs.seconds for needs in each))
+
+
+def of_benchmark(cases: Sequence[Needs]) -> Needs:
+    """What several cases take, one after the other."""
+    return Needs(max(one.memory for one in cases), sum(one.disk for one in cases), sum(one.seconds for one in cases))
