@@ -255,7 +255,7 @@ def beside_unknown(
     (`weighed`), and the decision which kinds of them are wrong at all is returned. Distances are left as they are.
 
     pixels: of the last images; surfaces: in the poses that were found, or None for voxels; rehearsed: [V, 7] errors of
-    the numbers in a rehearsal (`rehearsal.rehearsed`), of which each kind is made as uncertain as they are.
+    the numbers in a rehearsal (`views.rehearsed`), of which each kind is made as uncertain as they are.
     """
     uncertain, train = search.options.uncertain, np.flatnonzero(~search.scan.is_test)
     free = {kind: places for kind, places in KINDS.items() if kind != "distance" and getattr(uncertain, kind) > 0}
@@ -305,7 +305,7 @@ def _larger(away: np.ndarray, covariance: np.ndarray, kinds: list[list[int]]) ->
 def _information(
     search: PoseSearch, pixels: int, surfaces: SurfaceMesh | None, train: np.ndarray, places: list[int]
 ) -> Tensor:
-    """That of `following.of_poses`, on pixels `pixels` times larger."""
+    """That of `of_poses`, on pixels `pixels` times larger."""
     scan = search.scan.binned(pixels)
     exposures, grid = search.exposures(scan.exposures)[train], Grid.of_views(in_pixels(scan.views))
     if surfaces is None:

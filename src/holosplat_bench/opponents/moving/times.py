@@ -1,4 +1,4 @@
-"""Terms and fits of matter at several times: frames of a few times in each step, and total variation in space and time."""
+"""Terms and fits of matter at several times: frames of a few times a step, and total variation in space and time."""
 
 from __future__ import annotations
 
