@@ -14,7 +14,7 @@ from holosplat.checks import InputError
 from holosplat.io.reading import Reading
 from holosplat.io.table import Table
 from holosplat.projectors.surface import surface_thickness
-from holosplat.series.rows import Row, read_row, write_row
+from holosplat.series.folder import Row, read_row, write_row
 from holosplat.specimens.red_cells import icosphere
 from holosplat.workflows.preconditions import require_alike
 from holosplat.workflows.run_folder import RunFolder

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -56,10 +55,10 @@ class UncertainOptions:
 
     def options(self) -> PoseOptions:
         """The options of the search."""
-        from ..align import Drift, PoseOptions, Uncertain
+        from ..align import Drift, PoseOptions, PosePrior
 
         sizes = {name.removeprefix("uncertain_"): value for name, value in vars(self).items() if "drift" not in name}
-        return PoseOptions(Uncertain(**sizes), drift=Drift(self.drift_shift, self.drift_angle))
+        return PoseOptions(PosePrior(**sizes), drift=Drift(self.drift_shift, self.drift_angle))
 
 
 @dataclass(frozen=True)
@@ -89,10 +88,10 @@ class RefineOptions:
             changed = [name.replace("_", "-") for name, value in vars(self).items() if value != usual[name]]
             require(not changed, f"--{', --'.join(changed)} go with --refine, which says what is uncertain; add it.")
             return None
-        from ..align import PoseOptions, Uncertain
+        from ..align import PoseOptions, PosePrior
         from ..align.geometry import wanted
 
-        return PoseOptions(wanted(self.refine, Uncertain(**sizes)))
+        return PoseOptions(wanted(self.refine, PosePrior(**sizes)))
 
 
 def align(
@@ -203,7 +202,7 @@ def _write_geometry(
 
 def _write_table(path: Path, found: AlignedViews) -> None:
     """A row for each view."""
-    from ..io.atomic import atomic_path
+    from ..io.atomic import write_rows
 
     names = (
         "shift_x_px",
@@ -215,12 +214,11 @@ def _write_table(path: Path, found: AlignedViews) -> None:
         "magnification_share",
     )
     header = ["view", *names, *(f"error_{name}" for name in names), "flux", "before", "after"]
-    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(header)
-        for v in range(len(found.changes)):
-            last = (found.flux[v], found.before[v], found.after[v])
-            writer.writerow([v, *(f"{value:.6g}" for value in (*found.changes[v], *found.errors[v], *last))])
+    last = zip(found.flux, found.before, found.after)
+    rows = (
+        [v, *(f"{value:.6g}" for value in (*found.changes[v], *found.errors[v], *ends))] for v, ends in enumerate(last)
+    )
+    write_rows(path, header, rows)
 
 
 def _ratio(prior: MaterialPrior) -> float | None:

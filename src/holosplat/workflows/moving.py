@@ -10,7 +10,7 @@ from ..matter import KnownTwo, MaterialPrior
 from ..methods import Task
 from ..methods.assumed import assumed_material
 from ..methods.illumination import prepared
-from ..motion.flow_reconstruction import NOWHERE, CarriedOptions, Search, merged
+from ..motion.flow_reconstruction import NOWHERE, FlowOptions, FlowSearch, merged
 from ..optics.background import LightOptions
 from ..optics.sampling import fringe_sampling
 from ..progress import FitProgress
@@ -26,7 +26,7 @@ from .verdict import judge
 
 KIND = "carried"
 """The method's name in the files of a run."""
-USUAL = CarriedOptions()
+USUAL = FlowOptions()
 """The options by default."""
 
 
@@ -43,7 +43,7 @@ class FlowReconstruction:
 def reconstruct_moving(
     scan: Scan,
     prior: MaterialPrior,
-    options: CarriedOptions = USUAL,
+    options: FlowOptions = USUAL,
     seed: int = 0,
     *,
     light: LightOptions | None = None,
@@ -76,7 +76,7 @@ def reconstruct_moving(
     task = prepared(Task(train, prior, seed, lambda stage, part: on_progress(stage, part, {}), assumed))
     mean = merged(task.scan)
     material = assumed_material(mean, task.prior, task.on_progress)
-    search = Search(task, material, options, NOWHERE if folder is None else Checkpoint(folder))
+    search = FlowSearch(task, material, options, NOWHERE if folder is None else Checkpoint(folder))
     if going:
         search.take_up()
     elif ask and not search.moves(search.by_itself(mean, "mean of all times")):
