@@ -17,9 +17,10 @@ from ..progress import FitProgress
 from ..representations import VoxelGrid
 from ..scan import Scan
 from ..tables import to_table
+from .choice import Choice
 from .preconditions import check_frames, goes_on
 from .provenance import environment
-from .reconstruction import Assumptions, Choice, Reconstruction, config_of, write_run
+from .reconstruction import Assumptions, Reconstruction, config_of, write_run
 from .run_folder import Checkpoint, RunFolder
 from .run_illumination import light_options_of
 from .verdict import judge
