@@ -197,8 +197,10 @@ def _in_rows(
     frames, field = torch.from_numpy(scan.frames), scan.views.taller(beyond)
     how = Tikhonov(iterations=options.retrieval, backend=options.backend, leaves=beyond > 0, noise=correlated(light))
     report = partial(on_progress, "phase retrieval")
-    lines = carried_on(tikhonov(frames, scan.exposures, *material, options=how, on_progress=report), beyond)
-    rays = rays_of(lines, field, Grid.of_views(field), options.backend)
+    told = {"options": how, "missing": scan.gaps, "on_progress": report}
+    lines = carried_on(tikhonov(frames, scan.exposures, *material, **told), beyond)
+    gaps = None if scan.gaps is None else carried_on(scan.gaps.float(), beyond) > 0
+    rays = rays_of(lines, field, Grid.of_views(field), options.backend, gaps)
     first = min(TotalVariation.first, options.iterations)
     known = {"still_light": options.still_light, "misfit": options.misfit}
     inside = options.inside / scan.views.finest
@@ -259,6 +261,7 @@ def _agree(
     finer = math.ceil(fringe_sampling(scan.exposures) / refine)
     instrument = Instrument(scan.exposures, refine * finer, backend=options.backend)
     frames = torch.from_numpy(scan.frames).to(instrument.device)
+    gaps = None if scan.gaps is None else scan.gaps.to(instrument.device)
     beside = None if light is None or light.background is None else SolvedLight(light.background, frames, light.air)
     grid = Grid.of_views(views, refine)
     projector = projector_for(grid, views.refined(refine), options.backend)
@@ -270,7 +273,7 @@ def _agree(
         lines = solver.lines()
         predicted = frames_of(instrument, refined(lines, finer) * pitch, material).detach()
         lit = predicted if beside is None else predicted * beside.factor(images=predicted)
-        missing = frames - lit
+        missing = frames - lit if gaps is None else (frames - lit).masked_fill(gaps, 0.0)
         misfit = float(missing.square().sum())
         if misfit < least or done <= options.settling:
             best, least = solver.volume.clone(), misfit

@@ -156,7 +156,8 @@ def align(
         _write_geometry(geometry_out, scan, reading, (measured.exposures[lasting], exposures[lasting]), told, lines[0])
     facts = measured.provenance | {"aligned": lines[0]}
     light = measured.light if frames is measured.source else None  # that of frames which were turned back is not known
-    write_scan(out, Scan.of(frames, exposures, measured.is_test, facts, light))
+    missing = measured.missing if frames is measured.source else None
+    write_scan(out, Scan.of(frames, exposures, measured.is_test, facts, light, missing))
     print(f"wrote {out}: the same {len(measured)} frames, with other exposures", file=sys.stderr)
 
 

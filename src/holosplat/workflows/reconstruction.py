@@ -283,4 +283,4 @@ def reconstruction_at(done: Reconstruction, times: list[float], frame: int) -> R
 def with_time(scan: Scan, times: list[float], frame: int) -> Scan:
     """A scan of one time, which says 0 of it, as of the instant `frame` of `times` [s]."""
     exposures = replace(scan.exposures, time=[times[frame]] * len(scan))
-    return Scan.of(scan.source, exposures, scan.is_test, scan.provenance)
+    return scan.taken(exposures)
