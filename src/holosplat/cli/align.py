@@ -133,7 +133,7 @@ def align(
     )
     require(table is None or not axis_only, "--table is of single views; leave it, or --axis-only.")
     require(geometry_out is None or reading.part.views is None, "--geometry-out is of all frames; leave --views.")
-    measured, how = read_frames(scan, reading), unknown.options()
+    measured, how = read_frames(scan, reading, joined=False), unknown.options()
     if not axis_only:
         tell_frames("align", measured.exposures, out, lambda seen: of_alignment(seen, how))
     measured = measured.in_memory()
@@ -187,7 +187,7 @@ def _write_geometry(
     from ..io.formats import read_as
 
     measured, found = moved
-    whole = read_as(source, replace(reading, part=Part(time_frame=reading.part.time_frame))).exposures
+    whole = read_as(source, replace(reading, part=Part(time_frame=reading.part.time_frame)), joined=False).exposures
     whole = whole[: len(found)]
     scales = found.views.relative / measured.views.relative
     shifts = found.views.shifts - scales[:, None] * (measured.views.shifts - whole.views.shifts)

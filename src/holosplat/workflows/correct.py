@@ -215,7 +215,7 @@ def correct(
             described["rings"] = f"{options.rings} columns, {normal.pattern.std():.3%} (rms)"
         frames, doubt = _Corrected(fielding, normal), normal.light and normal.light.doubt
         whole = Scan.of(frames, file.exposures, file.is_test, file.provenance() | described, doubt)
-        scan = reading.applied(whole)
+        scan = reading.applied(whole, joined=False)
         lacks = scan[[0]].missing
         kept = {"light": scan.light, "mask": None if lacks is None else lacks[0]}
         with scan_writer(out, scan.exposures, scan.is_test, scan.provenance, **kept) as add:
