@@ -132,7 +132,7 @@ def align(
     )
     require(table is None or not axis_only, "--table is of single views; leave it, or --axis-only.")
     require(geometry_out is None or reading.part.views is None, "--geometry-out is of all frames; leave --views.")
-    measured, how = read_frames(scan, reading), unknown.options()
+    measured, how = read_frames(scan, reading, joined=False), unknown.options()
     if not axis_only:
         tell_frames("align", measured.exposures, out, lambda seen: of_alignment(seen, how))
     measured = measured.in_memory()
@@ -155,7 +155,8 @@ def align(
         _write_geometry(geometry_out, scan, reading, (measured.exposures[lasting], exposures[lasting]), told, lines[0])
     facts = measured.provenance | {"aligned": lines[0]}
     light = measured.light if frames is measured.source else None  # that of frames which were turned back is not known
-    write_scan(out, Scan.of(frames, exposures, measured.is_test, facts, light))
+    missing = measured.missing if frames is measured.source else None
+    write_scan(out, Scan.of(frames, exposures, measured.is_test, facts, light, missing))
     print(f"wrote {out}: the same {len(measured)} frames, with other exposures", file=sys.stderr)
 
 
@@ -185,7 +186,7 @@ def _write_geometry(
     from ..io.formats import read_as
 
     measured, found = moved
-    whole = read_as(source, replace(reading, part=Part(time_frame=reading.part.time_frame))).exposures
+    whole = read_as(source, replace(reading, part=Part(time_frame=reading.part.time_frame)), joined=False).exposures
     whole = whole[: len(found)]
     scales = found.views.relative / measured.views.relative
     shifts = found.views.shifts - scales[:, None] * (measured.views.shifts - whole.views.shifts)

@@ -14,7 +14,7 @@ from ..inference import Decision, Score, select
 from ..representations import Stored
 from ..scan import Scan
 from .cross_validation import predicted_frames
-from .first_volumes import EFFORT, Folds, score_of
+from .first_volumes import EFFORT, Folds
 from .keeper import NAME, Unseen
 from .method import Method, Task, run_stages, unheard
 
@@ -56,10 +56,8 @@ def decide_kind(task: Task, method: Method, null: str, other: str) -> Decision:
         last = _LastOfEachKind()
         part = replace(task, scan=seen, lit=lit, first=None, near=False, on_start=unheard)
         run_stages(method.with_effort(EFFORT), part, last)
-        measured = torch.from_numpy(unseen.frames)
-        return {
-            kind: score_of(measured, predicted_frames(unseen.exposures, *state)) for kind, state in last.states.items()
-        }
+        expected = {kind: predicted_frames(unseen.exposures, *state) for kind, state in last.states.items()}
+        return {kind: Score.of(unseen.left(frames.double())) for kind, frames in expected.items()}
 
     def score(kind: str, fold: int) -> Score:
         found = scores(fold)
