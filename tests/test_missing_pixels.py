@@ -21,12 +21,12 @@ from holosplat.geometry import Grid, Views
 from holosplat.io.formats import read_as, read_frames
 from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.io.reading import Part, Reading
-from holosplat.io.stored_frames import filled
 from holosplat.materials import parse_material
 from holosplat.matter import Matter
 from holosplat.model import Instrument
 from holosplat.optics.noise_model import NoiseModel
 from holosplat.optics.retrieval import RETRIEVALS
+from holosplat.preprocess.pixels import filled
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens import random_cells
 from holosplat.specimens.scene import MeshScene

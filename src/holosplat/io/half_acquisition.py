@@ -13,6 +13,7 @@ import numpy as np
 
 from ..checks import note
 from ..frames import Derived, Frames, Taken
+from ..preprocess.pixels import filled
 from ..scan import Scan
 from .angles import angles_of, is_half_acquisition
 
@@ -97,8 +98,6 @@ class Stitched(Derived):
         found = (total / np.where(none, 1, weight)).astype(np.float32)
         if not none.any():
             return found, None
-        from .stored_frames import filled  # which reads files
-
         return filled("the stitched frames", found, np.zeros(none.shape, dtype=bool), none, numbers)
 
     def _taken(self, numbers: np.ndarray) -> Taken:

@@ -11,18 +11,15 @@ from typing import Any
 import h5py
 import numpy as np
 
-from ..checks import InputError, note, require, warn
+from ..checks import InputError, note, require
 from ..frames import Derived, Frames, Taken
 from ..preprocess.flat_field import relative_intensity, unlit
-from ..preprocess.pixels import MOST_DEFECTS, PixelRepair
+from ..preprocess.pixels import FILLED, MOST_DEFECTS, filled
 from ..scan import Scan
 from .hdf5 import open_hdf5
 from .kept_frames import with_fields
 from .raw_file import DARK, FLAT, PROJECTION, Opens, ScanFile, Stack, rows_of
 from .stacks import ImageStack
-
-FILLED = "are filled from their neighbours, and have no weight"
-"""What is said of pixels that have no value of their own."""
 
 
 @dataclass(frozen=True)
@@ -108,34 +105,6 @@ def _places_of(stack: Stack, path: Path) -> list[Path]:
     if isinstance(stack, ImageStack):
         return [place for place, _ in stack.pages]
     return [path] * stack.shape[0]
-
-
-def filled(label: str, frames: np.ndarray, found: np.ndarray, mask: np.ndarray, numbers: np.ndarray) -> Taken:
-    """Frames [K, H, W] whose pixels `found` [K, H, W], and those of the `mask` [H, W] or [K, H, W], are filled from
-    their neighbours, and which pixels these are.
-
-    The number of those found is said; numbers: [K] of the frames. Errors: `InputError` for a frame with more than a
-    part `MOST_DEFECTS` of them.
-    """
-    if found.any():
-        shares, count = found.mean(axis=(1, 2)), int(found.any(axis=(1, 2)).sum())
-        worst = int(np.argmax(shares))
-        require(
-            shares[worst] <= MOST_DEFECTS,
-            f"{label} must hold relative intensities, finite and above 0, but {shares[worst]:.0%} of frame "
-            f"{numbers[worst]} are not; correct the frames by their flats and darks, crop them, or leave this one out.",
-        )
-        which = f"{int(found.sum())} pixels in {count} of {len(frames)} frames"
-        warn(f"{label}: {which} are not above 0, or no numbers; they {FILLED}")
-    missing = found | mask
-    if not missing.any():
-        return frames, None
-    repair = PixelRepair(missing[0])
-    for i, each in enumerate(missing):
-        if each.any():
-            repair = repair if np.array_equal(repair.mask, each) else PixelRepair(each)
-            frames[i] = repair(frames[i])
-    return frames, missing
 
 
 class Mended(Derived):

@@ -6,7 +6,8 @@ import numpy as np
 from scipy.ndimage import median_filter
 from scipy.sparse import csr_array
 
-from ..checks import require, shaped
+from ..checks import require, shaped, warn
+from ..frames import Taken
 
 NEIGHBOURHOOD = 5
 """Edge of the window that gives the usual level of a pixel."""
@@ -17,6 +18,8 @@ OUTLIER = 12.0
 LEAST_COUNTS = 1.0
 MOST_DEFECTS = 0.2
 """A larger share of defective pixels is no camera to reconstruct from."""
+FILLED = "are filled from their neighbours, and have no weight"
+"""What is said of pixels that have no value of their own."""
 NORMAL_MEDIAN = 0.6745
 """The median of |x| for a standard normal x."""
 
@@ -76,3 +79,31 @@ class PixelRepair:
                     entries += [1 / len(good)] * len(good)
                     break
         return csr_array((entries, (rows, columns)), shape=(len(self.places), h * w))
+
+
+def filled(label: str, frames: np.ndarray, found: np.ndarray, mask: np.ndarray, numbers: np.ndarray) -> Taken:
+    """Frames [K, H, W] whose pixels `found` [K, H, W], and those of the `mask` [H, W] or [K, H, W], are filled from
+    their neighbours, and which pixels these are.
+
+    The number of those found is said; numbers: [K] of the frames. Errors: `InputError` for a frame with more than a
+    part `MOST_DEFECTS` of them.
+    """
+    if found.any():
+        shares, count = found.mean(axis=(1, 2)), int(found.any(axis=(1, 2)).sum())
+        worst = int(np.argmax(shares))
+        require(
+            shares[worst] <= MOST_DEFECTS,
+            f"{label} must hold relative intensities, finite and above 0, but {shares[worst]:.0%} of frame "
+            f"{numbers[worst]} are not; correct the frames by their flats and darks, crop them, or leave this one out.",
+        )
+        which = f"{int(found.sum())} pixels in {count} of {len(frames)} frames"
+        warn(f"{label}: {which} are not above 0, or no numbers; they {FILLED}")
+    missing = found | mask
+    if not missing.any():
+        return frames, None
+    repair = PixelRepair(missing[0])
+    for i, each in enumerate(missing):
+        if each.any():
+            repair = repair if np.array_equal(repair.mask, each) else PixelRepair(each)
+            frames[i] = repair(frames[i])
+    return frames, missing
