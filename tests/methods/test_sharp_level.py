@@ -71,3 +71,14 @@ def test_the_level_is_that_of_the_denser_class():
     assert level_of(volume[:, torch.randperm(409)]) == 1
     with pytest.raises(InputError, match="empty volume has no level"):
         level_of(torch.zeros(3, 4, 5))
+
+
+def test_a_level_takes_as_many_views_as_take_no_longer(noisy):
+    """A volume of few rows has few voxels, and 181 views of it take as long as twelve of many rows."""
+    few = sharp_level.VIEWS * sharp_level.EDGE**3 // (2 * 320**2)
+    for shape, views, wanted in (((2, 320), 181, few), ((2, 320), few, few), ((200, 200), 20, 12), ((31, 33), 8, 8)):
+        exposures = Exposures.of(Views.evenly_spaced(views, shape, PIXEL), 20.0, 0.0)
+        scan = Scan.of(np.ones((views, *shape), dtype=np.float32), exposures, np.zeros(views, dtype=bool), {})
+        task = sharp_level.in_few_views(Task(scan, MaterialPrior.of_ratio(1.0)))
+        assert len(task.scan) == wanted
+        assert task.scan.views.rotations[[0, -1]].tolist() == scan.views.rotations[[0, -1]].tolist()

@@ -121,6 +121,12 @@ def test_a_volume_has_one_channel_where_beta_goes_with_delta():
     assert 0.0 in restored(signed, "values"), "what is empty stays empty"
 
 
+def test_colours_end_where_values_do():
+    """Whole numbers go a step beyond: of matter lighter than its medium the bar began above zero."""
+    lighter = volume_part(replace(LUMP, delta=-LUMP.delta, beta=-LUMP.beta), RASTER, 10**9)
+    assert lighter.facts["ends"] == [(-LUMP.delta.max(), 0.0)]
+
+
 def test_a_volume_is_binned_until_it_fits():
     part = volume_part(LUMP, RASTER, 3000)
     assert len(zlib.compress(part.arrays["values"].tobytes())) <= 3000

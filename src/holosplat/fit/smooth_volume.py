@@ -90,9 +90,7 @@ class VolumeProblem:
         self.grid = Grid.of_views(pixels)
         backend = resolve(backend)
         self.device = device(backend)
-        # torch's products: decisions on priors, and so the results, are those of earlier versions to the last bit
-        slices = "cuda" if backend == "cuda" else "reference"
-        self._projector = projector_for(self.grid, pixels, backend, slices)
+        self._projector = projector_for(self.grid, pixels, backend)
         self.support = None if support is None else support.to(self.device)
         self._symbol = self._data_symbol()
         frequencies = [torch.fft.fftfreq(n) for n in self.grid.shape[:2]] + [torch.fft.rfftfreq(self.grid.shape[2])]

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Protocol, Self, runtime_checkable
 
+import numpy as np
 import torch
 
 from ..baselines.material import MaterialEstimate
@@ -96,6 +97,11 @@ class Task:
         air, noise = torch.from_numpy(found.cut(self.lit.air.numpy())), self.lit.noise.white
         lit = Light(air, NoiseModel.white_only(noise, found.shape), None)
         return replace(self, scan=found.of(self.scan), lit=lit)
+
+    def of_views(self, chosen: np.ndarray) -> Task:
+        """The same task with the frames number `chosen` alone."""
+        lit = self.lit and self.lit.part(torch.from_numpy(chosen))
+        return replace(self, scan=self.scan[chosen], lit=lit, first=None)
 
     def moved(self, fitted: Model) -> Task:
         """The same task with the frames where a fit has found them."""

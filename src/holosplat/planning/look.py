@@ -81,7 +81,8 @@ class Look:
         share = self.noise / self.contrast if self.contrast > 0 else 0.0
         seen = f"{in_percent(self.noise)} of the level" + (f", {in_percent(share)} of the contrast" if share else "")
         span = f"rms {in_percent(self.contrast)}, values {_number(self.least)} to {_number(self.most)}"
-        return {"air level": air, "noise": seen if share > NOISELESS else "none is seen", "contrast": span}
+        noise = seen if share > NOISELESS else "none is seen" + (f" beyond {seen}" if self.noise > 0 else "")
+        return {"air level": air, "noise": noise, "contrast": span}
 
     def fringes(self, widths: np.ndarray) -> str:
         """Describe first fringes of such `widths` √(λz) [pixels], and of the finest detail above the noise."""

@@ -86,6 +86,7 @@ def _voxels(volume: Volume, pixel: float) -> ViewPart:
         {
             "low": [low for _, low, _ in stored],
             "step": [step for _, _, step in stored],
+            "ends": [(float(v.min(initial=0.0)), float(v.max(initial=0.0))) for v in values],
             "voxel": [float(size) / pixel for size in grid.voxel_size],
             "middle": [float(c) / pixel for c in grid.centre],
         },

@@ -397,8 +397,8 @@ function start(buffer) {
     pick("depth").max = count - 1;
     state.depth = Math.min(state.depth, count - 1);
     const { w, h, values } = sliceOf(part, arrays, state.plane, state.depth);
-    const low = part.low[0] < -1.5 * part.step[0] ? part.low[0] : 0, top = part.low[0] + 255 * part.step[0] || 1;
-    const ends = -low > top ? [top, low] : [low, top];  // what fills the field is dark
+    const [low, top] = part.ends[0], full = top || (low < 0 ? 0 : 1);
+    const ends = -low > full ? [full, low] : [low, full];  // what fills the field is dark
     const colour = shade(...ends, facts.colours);
     paint(pick("slice"), w, h, values, colour);
     bar("slice", ...ends, colour, cutUnit, cutFactor);
