@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
@@ -17,6 +17,7 @@ from ..fit.running import Record, interrupts_held
 from ..fit.smooth_volume import ContinuousPrior, Descent, VolumeProblem
 from ..fit.whitened import WhitenedFrames
 from ..geometry import Grid
+from ..matter import DeltaBeta
 from ..memory import memory_kept
 from ..model import Instrument, Model
 from ..optics.background import Light
@@ -49,6 +50,8 @@ NOTHING = 1e-3
 FALLING, WINDOW, LONGEST = 0.005, 10, 4
 """A round on voxels of a pixel that does not explain its frames goes on while so many iterations have lowered the
 objective by more than this part, up to so many times its iterations: many views of dense beads converge slowly."""
+ALIKE = 1e-6
+"""Difference of β, as a share, below which two materials have one ratio."""
 LEAST_EDGE = 12
 """Pixels along a frame's shorter side that larger ones must leave, or the fit is not begun on them."""
 
@@ -88,6 +91,26 @@ class SmoothPlan:
     faint: float
     loose: float
     backend: str
+    known: tuple[DeltaBeta, ...] = ()
+    """Materials that are known, of one sign of δ."""
+
+    @property
+    def levels(self) -> tuple[float, ...]:
+        """Occupancies that the known materials have in the start's unit, rising."""
+        return tuple(sorted(delta / self.begun.matter.delta for delta, _ in self.known))
+
+    def absorbed(self, u: Tensor) -> Tensor | None:
+        """β beside that of an occupancy u [Z, Y, X] of the start's material, by what lies between known materials of
+        which each has its own ratio δ/β; None where all matter has one."""
+        unit = self.begun.matter.channels[0]
+        knots = sorted((delta / unit.delta, beta) for delta, beta in self.known)
+        beside = [0.0, *(beta - level * unit.beta for level, beta in knots)]
+        if max(map(abs, beside)) <= ALIKE * abs(unit.beta):
+            return None
+        at, values = u.new_tensor([0.0, *(level for level, _ in knots)]), u.new_tensor(beside)
+        right = torch.bucketize(u, at).clamp(1, len(at) - 1)
+        share = (u - at[right - 1]) / (at[right] - at[right - 1])
+        return values[right - 1] + share.clamp(0, 1) * (values[right] - values[right - 1])
 
     @property
     def beyond(self) -> int:
@@ -130,6 +153,7 @@ class SmoothFit:
         self._strength, self._settled, self._kept = 1.0, False, False
         self._stronger: tuple[VoxelGrid, float] | None = None
         self._descent: Descent | None = None
+        self._begun = plan.begun.values[0]
         self._values: list[float] = []
         self._frames: tuple[int, WhitenedFrames] | None = None
 
@@ -244,7 +268,8 @@ class SmoothFit:
 
     def _descent_from(self, u: Tensor, frames: WhitenedFrames, leg: Leg) -> Descent:
         """A descent that begins at u [Z, Y, X], where the backend computes."""
-        problem = self._problem(frames, leg.factor)
+        self._begun = u
+        problem = self._problem(frames, leg.factor, u)
         return Descent(problem, u.to(problem.device), self._kept)
 
     def _end(self, leg: Leg, descent: Descent) -> None:
@@ -300,6 +325,8 @@ class SmoothFit:
         """u with what the prior has taken: the edges' way between rounds, the total's at the end. Low frequencies see
         the total by its absorption, so where δ/β was estimated they are no better than the others."""
         last = self._leg == len(self._legs) - 1
+        if last and self.plan.known:
+            return u
         told = last and self.plan.ratio_known
         return unshrunk(problem, u, self.plan.light is not None) if told else modulated(problem, u)
 
@@ -330,10 +357,14 @@ class SmoothFit:
         """Begin anew with a prior of that `strength`."""
         self._leg, self._volume, self._rival, self._strength = 0, self.plan.begun, None, strength
 
-    def _problem(self, frames: WhitenedFrames, factor: int) -> VolumeProblem:
+    def _problem(self, frames: WhitenedFrames, factor: int, u: Tensor) -> VolumeProblem:
         prior = self.plan.prior.weakened(self._strength)
         prior = prior if factor == 1 else prior.on_larger_voxels(factor)
-        return VolumeProblem(frames, prior, self._level, self.plan.backend)
+        prior = replace(prior, levels=self.plan.levels)
+        problem = VolumeProblem(frames, prior, self._level, self.plan.backend)
+        beside = self.plan.absorbed(u.to(problem.device))
+        frames.absorbed = None if beside is None else problem.lines(beside)
+        return problem
 
     def _frames_of(self, factor: int) -> WhitenedFrames:
         if self._frames is None or self._frames[0] != factor:
@@ -355,7 +386,7 @@ class SmoothFit:
             "more": self._more,
             "values": self._values,
             "rival": None if self._rival is None else [self._rival[0].cpu(), self._rival[1]],
-            "descent": None if self._descent is None else self._descent.state_dict(),
+            "descent": None if self._descent is None else self._descent.state_dict() | {"begun": self._begun.cpu()},
         }
 
     def load(self, state: dict[str, Any]) -> None:
@@ -371,7 +402,8 @@ class SmoothFit:
         self._descent = None
         if state["descent"] is not None:
             factor = self._legs[self._leg].factor
-            problem = self._problem(self._frames_of(factor), factor)
+            self._begun = state["descent"]["begun"]
+            problem = self._problem(self._frames_of(factor), factor, self._begun)
             self._descent = Descent.again(problem, state["descent"], problem.device)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
+import numpy as np
 import torch
 from scipy.sparse import csc_array, csr_array, diags_array, eye_array
 from scipy.sparse.linalg import splu
@@ -99,7 +100,7 @@ def extract_surfaces(cloud: GaussianCloud, scan: Scan, options: Extraction = Ext
 
     Errors: `InputError` if the cloud is not of one material, or there is no such surface.
     """
-    has = "two materials" if cloud.matter.second else "δ and β apart"
+    has = "several materials" if cloud.matter.others else "δ and β apart"
     require(
         cloud.matter.single,
         f"surfaces need one material of known δ and β, but this run has {has}; "
@@ -114,13 +115,21 @@ def extract_surfaces(cloud: GaussianCloud, scan: Scan, options: Extraction = Ext
 def cut_surfaces(
     occupancy: Tensor, grid: Grid, unit_length: float, matter: Matter, options: Extraction = Extraction()
 ) -> SurfaceMesh:
-    """The surfaces [`unit_length`] where occupancy [Z, Y, X] on `grid` crosses the level, filled with `matter`.
+    """The surfaces [`unit_length`] where occupancy [Z, Y, X] of the first material on `grid` crosses the level from
+    each material of `matter` to the one of the next weaker contrast, or to the medium.
 
-    Errors: `InputError` if there is no such surface.
+    Errors: `InputError` if one of them has no surface.
     """
-    mesh = isosurface(occupancy.numpy(), grid, options.level, options.least_volume, options.smoothing)
-    vertices = torch.from_numpy(mesh.vertices / unit_length)
-    return SurfaceMesh(vertices, torch.from_numpy(mesh.faces), unit_length, matter)
+    own = [delta / matter.delta for delta, _ in matter.channels]
+    vertices, faces, count = list[np.ndarray](), list[np.ndarray](), 0
+    for high, low in zip(own, [*own[1:], 0.0]):
+        level = low + options.level * (high - low)
+        mesh = isosurface(occupancy.numpy(), grid, level, options.least_volume, options.smoothing)
+        vertices.append(mesh.vertices / unit_length)
+        faces.append(mesh.faces + count)
+        count += len(mesh.vertices)
+    joined = (torch.from_numpy(np.concatenate(arrays)) for arrays in (vertices, faces))
+    return SurfaceMesh(*joined, unit_length, matter, parts=[len(part) for part in faces])
 
 
 def surface_fit(
