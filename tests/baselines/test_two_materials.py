@@ -222,7 +222,7 @@ def test_gaussians_of_two_start_as_one_or_the_other(shares, grid):
 
 def test_a_material_that_is_not_there_is_named(shares, grid):
     alone = torch.stack([shares.values[0], torch.zeros(grid.shape)])
-    with pytest.raises(InputError, match="nothing of the lighter"):
+    with pytest.raises(InputError, match="nothing of the material of δ"):
         cloud_from_shares(alone, grid, BOTH, PIXEL, PIXEL)
 
 

@@ -122,7 +122,7 @@ def test_two_materials_in_motion_are_refused_or_said_to_be_left(quick, capsys):
     how = (0, LightOptions(), QUICK)
     assert not motion.reconstruct_in_motion(quick / "s.nxs", Reading(), prior, RunFolder(quick / "none"), how)
     said = capsys.readouterr().err
-    assert "a flow carries one material, but two are known" in said
+    assert "a flow carries one material, but several are known" in said
     assert "nothing moves" not in said
     assert not (quick / "none").exists()
 

@@ -13,8 +13,10 @@ from torch import Tensor
 from ..backends import resolve
 from ..baselines import holographic_tv
 from ..baselines.two_materials import Shares, absorption, at_one_ratio, told_apart, two_levels
+from ..checks import require
 from ..geometry import Grid
 from ..matter import DeltaBeta, KnownRatio, Matter
+from ..model.instrument import MOST_CHANNELS
 from ..optics.noise import noise_share
 from ..optics.retrieval import retrieve_thickness
 from ..representations import (
@@ -41,6 +43,11 @@ def starting_cloud(task: Task, options: GaussianOptions) -> GaussianCloud:
     Where nothing is known of the matter, δ and β are free (`options.separate`, and at a random start), or those of the
     one material or the two that frames suggest.
     """
+    require(
+        len(task.prior.materials) <= MOST_CHANNELS,
+        f"Gaussians are of {MOST_CHANNELS} materials at most, but {len(task.prior.materials)} are known; give fewer, "
+        "or --method auto where frames show their surfaces.",
+    )
     return (_random if options.start == "random" else _from_phase_retrieval)(task, options)
 
 
