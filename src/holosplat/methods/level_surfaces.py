@@ -39,9 +39,8 @@ def surfaces_of_levels(task: Task, options: GaussianOptions, surfaces: SurfaceOp
         for chosen in combinations(range(len(materials)), count):
             with suppress(InputError):  # one of them has no surface
                 matter = Matter.several(*(materials[k] for k in chosen))
-                found[f"levels {', '.join(str(1 + k) for k in chosen)}"] = _of_levels(
-                    task, volume, matter, options, surfaces
-                )
+                name = "δ " + " and ".join(f"{delta:.3g}" for delta, _ in matter.channels)
+                found[name] = _of_levels(task, volume, matter, options, surfaces)
     require(len(found) > 0, "the volume holds no surface of the known materials.")
 
     def scored(name: str, fold: int) -> Score:
@@ -51,7 +50,7 @@ def surfaces_of_levels(task: Task, options: GaussianOptions, surfaces: SurfaceOp
 
     decision = select(NAME, tuple(found), scored, by=BY)
     task.on_start(decision, None)
-    return found[decision.choice]
+    return in_turns(task, found[decision.choice], options, surfaces)
 
 
 def _likeliest(task: Task, options: GaussianOptions) -> VoxelGrid:
@@ -64,8 +63,8 @@ def _likeliest(task: Task, options: GaussianOptions) -> VoxelGrid:
 def _of_levels(
     task: Task, volume: VoxelGrid, matter: Matter, options: GaussianOptions, surfaces: SurfaceOptions
 ) -> SurfaceMesh:
-    """Surfaces of `matter`, cut out of a `volume` and settled in turns."""
+    """Surfaces of `matter`, cut out of a `volume` and settled."""
     occupancy = volume.values[0].cpu() * (volume.matter.delta / matter.delta)
     cut = cut_as_seen(task, occupancy, volume.grid, matter, surfaces)
     how = options.coarse.of_views(len(task.scan.train()))
-    return in_turns(task, settled(task, cut, surfaces, how), options, surfaces)
+    return settled(task, cut, surfaces, how)
