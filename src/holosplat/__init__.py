@@ -2,7 +2,7 @@
 
 At the top are the acts (`simulate`, `reconstruct`, `evaluate` …), the nouns they take, and the methods; the rest is in
 namespaces: `holosplat.io`, `.align`, `.materials`, `.specimens`, `.beamline`, `.planning`, `.optics`, `.model`,
-`.methods`, `.representations`, `.preprocess`, `.metrics` and `.workflows`. The names are in the stub beside this file;
+`.methods`, `.representations`, `.preprocess`, `.metrics`, `.report` and `.workflows`. The names are in the stub here;
 each is imported from its module when it is first used, so that `import holosplat` costs nothing.
 """
 

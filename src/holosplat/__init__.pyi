@@ -9,6 +9,7 @@ from . import model as model
 from . import optics as optics
 from . import planning as planning
 from . import preprocess as preprocess
+from . import report as report
 from . import representations as representations
 from . import scan as scan
 from . import specimens as specimens

@@ -149,7 +149,7 @@ WRITTEN = {
     "materials": set(),
     "run": set(),
     "record": {"out", "truth"},
-    "simulate": {"out", "truth", "true_exposures"},
+    "simulate": {"out", "truth", "true_exposures", "truth_mesh"},
     "view": set(),
 }
 """What commands write; the others, what --out names alone."""

@@ -12,6 +12,7 @@ from helpers.runs import KNOWN, SMALL
 from helpers.soft import two_cells
 from holosplat.checks import InputError
 from holosplat.geometry import Grid
+from holosplat.inference import Compared, Decision
 from holosplat.io.json import read_json
 from holosplat.matter import MaterialPrior
 from holosplat.methods import GaussianRates, SmoothVolume, solve
@@ -105,6 +106,29 @@ def test_steps_of_a_method_and_other_kinds_are_no_rivals(scan):
         assert keeper.best is not None
         assert keeper.best.name == kept
         assert keeper.judged["second"] > keeper.judged["first"]
+
+
+def test_another_kind_must_also_predict_unseen_frames_better(scan):
+    train = scan.train()
+    good = solve(SMALL, Task(train, KNOWN), "levels")
+    assert isinstance(good, GaussianCloud)
+    grid = Grid.of_views(train.views)
+    voxels, asked = VoxelGrid(0 * good.density(grid)[None, 0], grid, good.matter), list[tuple[str, str]]()
+    for choice, gain, kept in (("voxels", -0.3, "second"), ("gaussians", 0.3, "first")):
+
+        def unseen(null, other, found=choice, gained=gain):
+            asked.append((null, other))
+            return Decision("result", found, "views set aside", (Compared(other, gained, 0.01),))
+
+        keeper = Keeper(train, True, unseen)
+        keeper.look("first", good, 2)
+        keeper.look("second", voxels, 2)
+        assert keeper.best is not None
+        assert keeper.best.name == kept
+        assert keeper.decisions[0].line.endswith(
+            f"(training frames; between kinds views set aside: first {gain:+.1%} ± 1.0%)"
+        )
+    assert asked == [("voxels", "gaussians")] * 2
 
 
 def test_old_summaries_say_nothing():

@@ -110,17 +110,35 @@ def holographic_tv(
     on_progress: Progress,
     light: Light | None = None,
     wanted: Wanted = _always,
+    lines: Tensor | None = None,
 ) -> tuple[Tensor, Grid]:
     """Occupancy [Z, Y, X] of `material` (δ and β of any sign) from the frames of `scan`, and its grid.
 
     `on_progress(stage, fraction)` is called between pieces of work. light: uneven light that the frames were divided
     by; what is left of it is found anew in each round of agreement, beside what the volume predicts. wanted: asked
-    before the rounds, unless there are none.
+    before the rounds, unless there are none. lines: what `retrieved` gave for these frames, where they are in even
+    light and matter does not go on beyond them.
     """
     with memory_kept():
         options = replace(options, backend=resolve(options.backend))
-        volume, grid = _holographic_tv(scan, material, options, on_progress, light, wanted)
+        volume, grid = _holographic_tv(scan, material, options, on_progress, light, wanted, lines)
         return volume.cpu(), grid
+
+
+def retrieved(
+    scan: Scan,
+    material: DeltaBeta,
+    options: HolographicTV,
+    on_progress: Progress,
+    light: Light | None = None,
+    leaves: bool = False,
+) -> Tensor:
+    """Thickness [V, H, W] of `material` [m], which phase retrieval finds in every view by itself; leaves: whether
+    matter goes on above and below the frames."""
+    backend, noise = resolve(options.backend), correlated(light)
+    how = Tikhonov(iterations=options.retrieval, backend=backend, leaves=leaves, noise=noise)
+    report = partial(on_progress, "phase retrieval")
+    return tikhonov(torch.from_numpy(scan.frames), scan.exposures, *material, options=how, on_progress=report)
 
 
 def agreed(
@@ -152,12 +170,13 @@ def _holographic_tv(
     on_progress: Progress,
     light: Light | None,
     wanted: Wanted,
+    lines: Tensor | None,
 ) -> tuple[Tensor, Grid]:
     noise = noise_share(torch.from_numpy(scan.frames))
     scan, refine, factor = _working_resolution(scan, options)
     light = light if light is None or factor == 1 else light.part(torch.arange(len(scan)), factor)
     if light is None or light.background is None or options.still_light:  # still light is an unknown of tomography
-        solver = _tomography(scan, material, options, on_progress, light)
+        solver = _tomography(scan, material, options, on_progress, light, lines if factor == 1 else None)
     else:
         scan, light, solver = _settled(scan, material, options, on_progress, light)
     alone = absorption_alone(scan.exposures, material.beta / material.delta)  # then retrieval left nothing to correct
@@ -169,17 +188,27 @@ def _holographic_tv(
 
 
 def _tomography(
-    scan: Scan, material: DeltaBeta, options: HolographicTV, on_progress: Progress, light: Light | None
+    scan: Scan,
+    material: DeltaBeta,
+    options: HolographicTV,
+    on_progress: Progress,
+    light: Light | None,
+    lines: Tensor | None = None,
 ) -> PrimalDual:
     """Phase retrieval of each view and total variation: the solver, on voxels of one pixel.
 
     Where its volume has matter at the top or at the bottom, both are done anew with matter beyond the frames; but not
     where a bound says how much of it there is, for it is then right to a few rows without them.
     """
-    solver = _in_rows(scan, material, options, on_progress, 0, light)
+    if lines is None:
+        lines = retrieved(scan, material, options, on_progress, light)
+    solver = _volume_of(lines, scan, material, options, on_progress)
     free = options.beyond and options.upper == 0 and options.still_light == 0
     beyond = rows_beyond(solver.volume, scan, material.beta / material.delta) if free else 0
-    return _in_rows(scan, material, options, on_progress, beyond, light) if beyond else solver
+    if not beyond:
+        return solver
+    lines = carried_on(retrieved(scan, material, options, on_progress, light, leaves=True), beyond)
+    return _volume_of(lines, scan, material, options, on_progress)
 
 
 def correlated(light: Light | None) -> NoiseModel | None:
@@ -190,14 +219,11 @@ def correlated(light: Light | None) -> NoiseModel | None:
     return light.doubt
 
 
-def _in_rows(
-    scan: Scan, material: DeltaBeta, options: HolographicTV, on_progress: Progress, beyond: int, light: Light | None
+def _volume_of(
+    lines: Tensor, scan: Scan, material: DeltaBeta, options: HolographicTV, on_progress: Progress
 ) -> PrimalDual:
-    """The same for a volume with so many rows beyond the frames."""
-    frames, field = torch.from_numpy(scan.frames), scan.views.taller(beyond)
-    how = Tikhonov(iterations=options.retrieval, backend=options.backend, leaves=beyond > 0, noise=correlated(light))
-    report = partial(on_progress, "phase retrieval")
-    lines = carried_on(tikhonov(frames, scan.exposures, *material, options=how, on_progress=report), beyond)
+    """Total variation on the thickness [V, H, W] of views, which may have rows beyond the frames."""
+    field = scan.views.taller((lines.shape[1] - scan.views.shape[0]) // 2)
     rays = rays_of(lines, field, Grid.of_views(field), options.backend)
     first = min(TotalVariation.first, options.iterations)
     known = {"still_light": options.still_light, "misfit": options.misfit}

@@ -16,6 +16,9 @@ from .light_frames import light_frames
 from .raw_file import DARK, FLAT, INVALID, PROJECTION, ScanFile, together
 from .reading import marked
 
+NAMED = 5
+"""Frames that a message names at most."""
+
 
 def with_fields(file: ScanFile, given: Mapping[str, Any]) -> ScanFile:
     """The file with the flats and darks that are `given` beside it (paths), after its own, and without frames to leave
@@ -72,11 +75,12 @@ def _without_odd(file: ScanFile, is_told: bool) -> ScanFile:
     kinds = file.kinds.copy()
     for kind, odd in found.items():
         numbers, (word, other) = file.numbers(kind)[odd], ("flat", "dark") if kind == FLAT else ("dark", "flat")
-        named = ", ".join(file.name(n) for n in numbers)
+        first = ", ".join(file.name(n) for n in numbers[:NAMED])
+        named = f"{first} and {len(numbers) - NAMED} more" if len(numbers) > NAMED else first
         require(
             2 * len(numbers) < len(odd) or not len(numbers) or is_told,
-            f"{file.path} must have {word}s that are alike and no {other}s, but {named} differ; leave those that are "
-            "wrong by --leave-out.",
+            f"{file.path} must have {word}s that are alike and no {other}s, but {named} differ; check image_key, and "
+            "leave those that are wrong by --leave-out.",
         )
         if len(numbers):
             kept = "stays, as --leave-out does not name it" if is_told else "is left out; --leave-out chooses otherwise"

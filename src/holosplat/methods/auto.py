@@ -60,15 +60,8 @@ class Auto(Method):
 
     def with_effort(self, effort: float) -> Auto:
         """The same method with `effort` times the steps, at least one."""
-        schedule = self.surfaces.fit.schedule
-        fewer = replace(schedule, steps=max(1, round(effort * schedule.steps)))
-        surfaces = replace(self.surfaces, fit=replace(self.surfaces.fit, schedule=fewer))
-        return replace(
-            self,
-            gaussians=self.gaussians.with_effort(effort),
-            surfaces=surfaces,
-            volume=self.volume.with_effort(effort),
-        )
+        bodies = Bodies(self.gaussians, self.surfaces).with_effort(effort)
+        return Auto(bodies.gaussians, bodies.surfaces, self.volume.with_effort(effort))
 
 
 @dataclass(frozen=True)
@@ -85,6 +78,10 @@ class Bodies(Method):
         """Those of the Gaussians and the surfaces."""
         bodies = BodiesStage(self.gaussians, surfaces=self.surfaces)
         return (bodies, SurfacesWhereClosed(self.surfaces, self.gaussians.coarse, bodies.best_cut))
+
+    def with_effort(self, effort: float) -> Bodies:
+        """The same method with `effort` times the steps, at least one."""
+        return Bodies(self.gaussians.with_effort(effort), self.surfaces.with_effort(effort))
 
 
 @dataclass(frozen=True)

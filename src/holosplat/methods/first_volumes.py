@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ..backends import resolve
 from ..baselines import HolographicTV, holographic_tv
+from ..baselines.holographic_tv import retrieved
 from ..inference import Score
 from ..matter import DeltaBeta, MaterialPrior, Matter
 from ..optics.background import Background, Light
@@ -33,6 +34,8 @@ FEWEST = 3
 """Views from which on some are set aside; of fewer, noise is added and taken off again (`Folds`)."""
 MANY, MOST = 6, 3
 """Views from which on two are set aside at a time, and folds at most: six views tell their scatter well enough."""
+EFFORT = 0.2
+"""Part of the usual steps of a fit by which hypotheses are compared: all of them have as many."""
 CHECKED = 4
 """Edge of the squares [pixels], in which unknown light of unseen frames is fitted and tested in turns."""
 
@@ -53,27 +56,35 @@ class Folds:
     scan: Scan
     count: int
     by: str
+    binning: int = 1
 
     @classmethod
     def of(cls, train: Scan) -> Folds:
         """Of training frames of one time."""
-        scan, views = train.binned(train.largest_binning(math.ceil(max(train.views.shape) / WIDTH))), len(train)
-        if views < FEWEST:
-            return cls(scan, 1, BY_FISSION)
-        return cls(scan, MOST if views >= MANY else views, BY_VIEWS)
+        binning, views = train.largest_binning(math.ceil(max(train.views.shape) / WIDTH)), len(train)
+        by, most = (BY_FISSION, 1) if views < FEWEST else (BY_VIEWS, MOST if views >= MANY else views)
+        return cls(train.binned(binning), most, by, binning)
+
+    def aside(self, fold: int) -> np.ndarray:
+        """Numbers of the views that are not fitted. Folds share none; many views are not all predicted."""
+        views = len(self.scan)
+        together = 1 if views < MANY else 2
+        chosen = np.unique(np.arange(together * self.count) * views // (together * self.count))
+        return chosen[fold :: self.count]
+
+    def kept(self, fold: int) -> np.ndarray:
+        """Numbers of the views that are fitted: all of them, where noise is split."""
+        views = np.arange(len(self.scan))
+        return views if self.by == BY_FISSION else np.setdiff1d(views, self.aside(fold))
 
     def split(self, fold: int) -> tuple[Scan, Scan]:
-        """What is fitted, and what is predicted. Folds share no view; many views are not all predicted."""
+        """What is fitted, and what is predicted."""
         if self.by == BY_FISSION:
             frames = torch.from_numpy(self.scan.frames)
             draw = torch.randn(frames.shape, generator=torch.Generator().manual_seed(0))
             noise = noise_levels(frames)[:, None, None].float() * draw
             return tuple(replace(self.scan, frames=(frames + s * noise).numpy()) for s in (1, -1))  # type: ignore[return-value]
-        views = len(self.scan)
-        together = 1 if views < MANY else 2
-        chosen = np.unique(np.arange(together * self.count) * views // (together * self.count))
-        aside = chosen[fold :: self.count]
-        return self.scan[np.setdiff1d(np.arange(views), aside)], self.scan[aside]
+        return self.scan[self.kept(fold)], self.scan[self.aside(fold)]
 
 
 @dataclass
@@ -85,7 +96,7 @@ class FirstVolumes:
     on_progress: Progress
     options: HolographicTV = field(
         default_factory=lambda: HolographicTV(
-            retrieval=20, iterations=80, corrections=3, upper=0.0, refine=1, beyond=False
+            retrieval=20, iterations=80, corrections=3, upper=0.0, refine=1, beyond=False, relit=1
         )
     )
     taken: tuple[str, ...] = ()
@@ -106,12 +117,19 @@ class FirstVolumes:
             self._made[key, fold] = make()
         return self._made[key, fold]  # type: ignore[return-value]
 
-    def volume(self, seen: Scan, light: Light | None) -> VoxelGrid:
-        """The volume of frames that were measured in `light` (None: even light, white noise)."""
-        frames = torch.from_numpy(seen.frames)
-        even = seen if light is None else replace(seen, frames=light.evened(frames).numpy())
-        values, grid = holographic_tv(even, self.material, self.options, self.on_progress, light)
+    def volume(self, fold: int, light: Light) -> VoxelGrid:
+        """The volume of the fitted frames of a fold, which were measured in `light`."""
+        seen, _ = self.folds.split(fold)
+        even, lines = replace(seen, frames=light.evened(torch.from_numpy(seen.frames)).numpy()), None
+        plain = light.background is None and light.still is None and not light.noise.has_grain
+        if plain and self.folds.by == BY_VIEWS:
+            lines = self.once("thickness", 0, self._thickness)[self.folds.kept(fold)]
+        values, grid = holographic_tv(even, self.material, self.options, self.on_progress, light, lines=lines)
         return VoxelGrid(values[None], grid, Matter.one(*self.material)).on(resolve(self.options.backend))
+
+    def _thickness(self) -> Tensor:
+        """What phase retrieval finds in all coarse frames as they were measured, each by itself: folds share it."""
+        return retrieved(self.folds.scan, self.material, self.options, self.on_progress)
 
 
 def lit_by_halves(measured: Tensor, predicted: Tensor, known: Background) -> Tensor:

@@ -25,7 +25,7 @@ from .assumed import assumed_material
 from .contrast import STAGE as SIGN
 from .contrast import Scoring, decide_sign, with_sign
 from .cross_validation import predicted_frames
-from .first_volumes import BY_FISSION, FirstVolumes
+from .first_volumes import BY_FISSION, EFFORT, FirstVolumes
 from .levels import TrialFits
 from .method import Method, Task
 from .trials import UNEVEN, Hypothesis, Trials, first_of_task, name_of, named, plain_light, rivals, with_more
@@ -34,9 +34,6 @@ from .volume import SmoothVolume
 STAGE = "light and noise"
 HYPOTHESES = ("fixed pattern", FLUX, UNEVEN, "correlated noise")
 """What may be added to the null, in this order where several predict alike."""
-
-EFFORT = 0.2
-"""Part of the usual steps of a fit that confirms a hypothesis: what it is compared with has as many."""
 
 Prepared = tuple[Hypothesis, tuple[Decision, ...]]
 """What was taken, and the decisions that led to it."""

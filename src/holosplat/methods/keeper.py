@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, cast
 
@@ -18,6 +18,9 @@ from .cross_validation import MissingMatter, predicted_frames
 
 NAME = "result"
 BY = "training frames"
+
+Unseen = Callable[[str, str], Decision]
+"""Which of two kinds of Objects predicts unseen frames, the null first."""
 
 
 @dataclass(frozen=True)
@@ -44,23 +47,29 @@ class Keeper:
     mixed: whether states of different kinds of Objects compete; else those of another kind than the latest are out, for
     who asks for surfaces wants surfaces
 
+    unseen: decides between two kinds; None: training frames do
+
     The latest state is the null: an earlier one is kept if it explains the frames better by the policy of `Compared`.
+    One of another kind, whose freedom is another, must also predict unseen frames better.
     """
 
     train: Scan
     mixed: bool = False
+    unseen: Unseen | None = None
     best: State | None = None
     judged: dict[str, float] = field(default_factory=dict)
     """Share of all matter that each state leaves unexplained (`MissingMatter`), by its name."""
     compared: list[Compared] = field(default_factory=list)
     """Every earlier state beside the one that came after it."""
+    by: str = BY
+    """By which frames."""
     _judge: MissingMatter | None = None
 
     @property
     def decisions(self) -> tuple[Decision, ...]:
         """Which state was kept, where some competed."""
         compared, best = tuple(self.compared), self.best
-        return (Decision(NAME, best.name, BY, compared),) if best and compared else ()
+        return (Decision(NAME, best.name, self.by, compared),) if best and compared else ()
 
     def moved(self, train: Scan) -> None:
         """The training frames are elsewhere from now on."""
@@ -86,6 +95,10 @@ class Keeper:
         compared = Compared(best.name, *earlier.gain_over(later))
         if not (fitted and (self.mixed or same)):
             return not (same and compared.wins and _lost(latest.predicted, best.predicted))
+        if compared.wins and not same and self.unseen is not None:
+            decision = self.unseen(latest.object.kind, best.object.kind)
+            compared = replace(decision.compared[0], name=best.name)
+            self.by = f"{BY}; between kinds {decision.by}"
         self.compared.append(compared)
         return not compared.wins
 
@@ -102,6 +115,7 @@ class Keeper:
             "placed": where(best.exposures),
             "judged": dict(self.judged),
             "compared": [asdict(each) for each in self.compared],
+            "by": self.by,
         }
 
     def load(self, saved: dict[str, Any] | None) -> None:
@@ -112,6 +126,7 @@ class Keeper:
             self.best = State.of(saved["name"], found, saved["oversample"], exposures)
             self.judged = dict(saved["judged"])
             self.compared = [Compared(**each) for each in saved["compared"]]
+            self.by = saved.get("by", BY)
 
 
 def where(exposures: Exposures) -> dict[str, Tensor]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import ClassVar, Protocol, Self, runtime_checkable
 
 import torch
 
@@ -22,7 +22,7 @@ from ..progress import Advance, Progress
 from ..representations import Stored
 from ..scan import Scan
 from .first_volumes import FirstVolumes
-from .keeper import Keeper
+from .keeper import Keeper, Unseen
 from .window import windows_of
 
 
@@ -187,6 +187,10 @@ class Method(Protocol):
         """The stages, in their order; each resumes by itself."""
         ...
 
+    def with_effort(self, effort: float) -> Self:
+        """The same method with `effort` times the steps, at least one; one without steps is the same."""
+        return self
+
     def require_files(self) -> None:
         """Read the files that the method names, so that one that is missing or damaged is refused before any work.
         Errors: those of reading."""
@@ -213,23 +217,38 @@ def run_quietly(fit: Running, report: Advance) -> Stored:
     return finished(fit)
 
 
-def solve_stages(method: Method, task: Task) -> Stored:
+class Observer(Protocol):
+    """What looks at the states of a run."""
+
+    def look(self, name: str, found: Stored, oversample: int, fitted: bool = True) -> None:
+        """At the latest one; see `Keeper.look`."""
+
+    def moved(self, train: Scan) -> None:
+        """The training frames are elsewhere from now on."""
+
+
+def solve_stages(method: Method, task: Task, unseen: Unseen | None = None) -> Stored:
     """Run all stages of `method` in memory, without a folder; the best of their states (`Keeper`), as in a run folder.
 
-    Ctrl-C is passed on.
+    unseen: as of `Keeper`. Ctrl-C is passed on.
     """
+    keeper = Keeper(task.scan, method.mixes_kinds, unseen)
+    run_stages(method, task, keeper)
+    assert keeper.best is not None
+    return keeper.best.object
+
+
+def run_stages(method: Method, task: Task, observer: Observer) -> None:
+    """Run all stages of `method` in memory; Ctrl-C is passed on."""
     found: Stored | None = None
-    keeper = Keeper(task.scan, method.mixes_kinds)
     for number, stage in enumerate(method.stages()):
         before = found
         found, task = begun(stage, task, before)
         fit = stage.fit(task.in_windows(), found)
         if found is not before and (number == 0 or fit is None):
-            keeper.look(stage.name if number else "start", found, fit.oversample if fit else 0, fitted=False)
+            observer.look(stage.name if number else "start", found, fit.oversample if fit else 0, fitted=False)
         if fit is not None:
             found = run_quietly(fit, task.report(stage.name))
             task = replace(task.moved(fit.result()), near=False)
-            keeper.moved(task.scan)
-            keeper.look(stage.name, found, fit.oversample, fitted=not method.likelier)
-    assert keeper.best is not None
-    return keeper.best.object
+            observer.moved(task.scan)
+            observer.look(stage.name, found, fit.oversample, fitted=not method.likelier)

@@ -10,8 +10,9 @@ from .method import Task
 from .volume import SmoothStage, SmoothVolume
 
 STAGE = "level of the matter"
-EDGE = 96
-"""Voxels along an edge of the volume whose level is taken, at most: it takes some ten seconds on one core."""
+EDGE, VIEWS = 96, 16
+"""Voxels along an edge of the volume whose level is taken, at most, in so many views: it takes some ten seconds on one
+core. Of more views there are fewer voxels, for the work is that of their product."""
 
 
 def material_of_levels(task: Task, backend: Backend = "auto", options: MaterialEstimate = DEFAULT) -> DeltaBeta:
@@ -29,7 +30,8 @@ def material_of_levels(task: Task, backend: Backend = "auto", options: MaterialE
     if not (task.bounded and isinstance(task.prior, KnownRatio)):
         return material
     task.on_progress(STAGE, 0.0)
-    stage = SmoothStage(SmoothVolume(estimate=options, max_voxels=EDGE**3, rounds=1, faint=0.0))
+    voxels = EDGE**3 * VIEWS // max(VIEWS, len(task.scan))
+    stage = SmoothStage(SmoothVolume(estimate=options, max_voxels=max(1, voxels), rounds=1, faint=0.0))
     fit = stage.fit(task, stage.start(task, None))
     fit.run(lambda record: task.on_progress(STAGE, fit.share))
     found = fit.voxels

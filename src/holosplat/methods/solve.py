@@ -16,6 +16,7 @@ from ..tables import to_table
 from .auto import Auto
 from .gaussians import Gaussians
 from .illumination import prepared
+from .kinds import unseen_kinds
 from .levels import LEVELS, NAME, decide_matter, kind_of
 from .method import Method, Task, solve_stages
 from .uncertain import Determined, Uncertain, determine, likeliest_ratio, placed, told
@@ -98,4 +99,5 @@ def solve(method: Method, task: Task, matter: MatterKind | None = None) -> Store
     """What `method` makes of `task` in memory, without a folder; Ctrl-C is passed on. matter: as for `settled`."""
     task = prepared(task, method)
     found = settled(method, task, matter)
-    return solve_stages(found.method, found.task(task))
+    task = found.task(task)
+    return solve_stages(found.method, task, unseen_kinds(task, found.method))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 import torch
@@ -96,6 +97,11 @@ class SurfaceOptions:
 
     extraction: Extraction = field(default_factory=Extraction)
     fit: SurfaceFit = field(default_factory=SurfaceFit)
+
+    def with_effort(self, effort: float) -> Self:
+        """The same options with `effort` times the steps, at least one."""
+        schedule = replace(self.fit.schedule, steps=max(1, round(effort * self.fit.schedule.steps)))
+        return replace(self, fit=replace(self.fit, schedule=schedule))
 
 
 def extract_surfaces(cloud: GaussianCloud, scan: Scan, options: Extraction = Extraction()) -> SurfaceMesh:

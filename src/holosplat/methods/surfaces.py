@@ -67,8 +67,7 @@ class Surfaces(SurfaceOptions, Method):
 
     def with_effort(self, effort: float) -> Surfaces:
         """The same method with `effort` times the steps, at least one."""
-        schedule = replace(self.fit.schedule, steps=max(1, round(effort * self.fit.schedule.steps)))
-        return replace(self, gaussians=self.gaussians.with_effort(effort), fit=replace(self.fit, schedule=schedule))
+        return replace(super().with_effort(effort), gaussians=self.gaussians.with_effort(effort))
 
 
 @dataclass(frozen=True)

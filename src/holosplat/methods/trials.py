@@ -125,7 +125,7 @@ class Trials:
         seen, unseen = self._first.folds.split(fold)
         light = self._light(hypothesis, fold)
         assert light is not None
-        volume = self._first.volume(seen, light)
+        volume = self._first.volume(fold, light)
         return Trial(volume, light, seen, unseen, predictions(volume, unseen))
 
 

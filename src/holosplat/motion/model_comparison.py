@@ -82,6 +82,6 @@ def compared_kinds(cells: BodyTracker, other: BodyTracker) -> Followed:
 
 
 def unexplained(of: BodyTracker) -> Score:
-    """What the bodies leave of the training frames."""
+    """The residual of the training frames with the bodies."""
     assert of.bodies is not None
     return Score.of(torch.from_numpy(of.train.frames - predicted(of.train, of.bodies, of.oversample)))

@@ -89,7 +89,7 @@ class Trials:
 
 
 class Tried(NamedTuple):
-    """What a fit leaves of its frames, and its bodies."""
+    """The residual of a fit, and its bodies."""
 
     left: Score
     bodies: MovingSurfaces

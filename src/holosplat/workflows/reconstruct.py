@@ -23,6 +23,7 @@ from ..matter import MaterialPrior, MatterKind
 from ..methods import Auto, Gaussians, Method, Settled, Stage, Task, begun, finished, learned, settled
 from ..methods.illumination import prepared
 from ..methods.keeper import Keeper, placed_at, where
+from ..methods.kinds import unseen_kinds
 from ..methods.uncertain import Determined, Uncertain
 from ..optics.background import LightOptions
 from ..optics.sampling import fringe_sampling
@@ -239,6 +240,7 @@ class _Run:
         self.method, self.constants = found.method, found.constants
         self.task = found.task(self.task)
         self._keeper.train = self.task.scan
+        self._keeper.unseen = unseen_kinds(self.task, self.method)
         where: dict[str, Any] = {} if geometry is None else {"geometry": geometry.as_dict()}
         self._config["decided"] = (
             found.as_table() | decisions_of(self.task) | {"scan_hash": scan_hash(found.placed(scan))} | where
