@@ -30,7 +30,6 @@ from holosplat.model import Instrument, measure
 from holosplat.representations import GaussianCloud, VoxelLines, approximate, cloud_from_shares
 from holosplat.representations.gaussians import raw_of
 from holosplat.scan import Exposures, Scan
-from holosplat.series.settings import prior_of
 from holosplat.specimens.capsules import place_capsules
 from holosplat.specimens.red_cells import random_cells
 from holosplat.specimens.scene import MeshScene
@@ -252,13 +251,6 @@ def test_materials_that_delta_does_not_tell_apart_are_refused():
         MaterialPrior.known(SILICA, DeltaBeta(SILICA.delta, 0.0))
     with pytest.raises(InputError, match="must all have δ above"):
         MaterialPrior.known(SILICA, DeltaBeta(-1e-7, 0.0))
-
-
-def test_several_materials_are_the_same_in_a_file():
-    several = MaterialPrior.known(OIL, DeltaBeta(2e-7, 0.0), SILICA)
-    assert prior_of(several.as_dict()) == several
-    old = {"kind": "known", "delta": SILICA.delta, "beta": SILICA.beta, "second_delta": OIL.delta}
-    assert prior_of(old | {"second_beta": OIL.beta}) == PRIOR
 
 
 # --- reconstruction -----------------------------------------------------------------------------------------

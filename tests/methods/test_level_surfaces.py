@@ -15,6 +15,7 @@ from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta, MaterialPrior, Matter
 from holosplat.methods import Gaussians, Task
 from holosplat.methods import level_surfaces as levels
+from holosplat.methods.known_levels import KnownLevels
 from holosplat.methods.surface_fit import SurfaceOptions, cut_surfaces
 from holosplat.representations import SurfaceMesh, VoxelGrid
 from holosplat.scan import Exposures, Scan
@@ -79,6 +80,17 @@ def test_they_are_the_same_after_a_file():
     assert (again.parts, again.matter) == (cut().parts, cut().matter)
     with pytest.raises(InputError, match="parts must say how many of"):
         SurfaceMesh(cut().vertices, cut().faces, PIXEL, cut().matter, parts=[1, 2])
+
+
+def test_what_known_materials_absorb_lies_between_them():
+    """In units of the wall: nothing in the medium, and each material its own, without the unit's β."""
+    known = KnownLevels((WALL, LIQUID), DeltaBeta(WALL.delta, 2e-9))
+    assert known.occupancies == pytest.approx((0.5, 1.0))
+    beside = known.absorbed(torch.tensor([0.0, 0.25, 0.5, 1.0, 1.2]))
+    assert beside is not None
+    own = [0.0, 0.5 * (LIQUID.beta - 1e-9), LIQUID.beta - 1e-9, 1e-9, 1e-9]
+    np.testing.assert_allclose(beside.numpy(), own, rtol=1e-5, atol=1e-15)
+    assert KnownLevels((WALL,), WALL).absorbed(torch.ones(3)) is None
 
 
 def quick() -> Gaussians:

@@ -25,6 +25,7 @@ from ..optics.noise_model import NoiseModel
 from ..optics.sampling import fringe_sampling
 from ..representations import VoxelGrid
 from ..scan import Scan
+from .known_levels import KnownLevels
 from .modulation import modulated, unshrunk
 
 EXPLAINED, WEAKER = 0.95, 0.98
@@ -50,8 +51,6 @@ NOTHING = 1e-3
 FALLING, WINDOW, LONGEST = 0.005, 10, 4
 """A round on voxels of a pixel that does not explain its frames goes on while so many iterations have lowered the
 objective by more than this part, up to so many times its iterations: many views of dense beads converge slowly."""
-ALIKE = 1e-6
-"""Difference of β, as a share, below which two materials have one ratio."""
 LEAST_EDGE = 12
 """Pixels along a frame's shorter side that larger ones must leave, or the fit is not begun on them."""
 
@@ -95,22 +94,9 @@ class SmoothPlan:
     """Materials that are known, of one sign of δ."""
 
     @property
-    def levels(self) -> tuple[float, ...]:
-        """Occupancies that the known materials have in the start's unit, rising."""
-        return tuple(sorted(delta / self.begun.matter.delta for delta, _ in self.known))
-
-    def absorbed(self, u: Tensor) -> Tensor | None:
-        """β beside that of an occupancy u [Z, Y, X] of the start's material, by what lies between known materials of
-        which each has its own ratio δ/β; None where all matter has one."""
-        unit = self.begun.matter.channels[0]
-        knots = sorted((delta / unit.delta, beta) for delta, beta in self.known)
-        beside = [0.0, *(beta - level * unit.beta for level, beta in knots)]
-        if max(map(abs, beside)) <= ALIKE * abs(unit.beta):
-            return None
-        at, values = u.new_tensor([0.0, *(level for level, _ in knots)]), u.new_tensor(beside)
-        right = torch.bucketize(u, at).clamp(1, len(at) - 1)
-        share = (u - at[right - 1]) / (at[right] - at[right - 1])
-        return values[right - 1] + share.clamp(0, 1) * (values[right] - values[right - 1])
+    def levels(self) -> KnownLevels:
+        """The same in the unit of the start."""
+        return KnownLevels(self.known, self.begun.matter.channels[0])
 
     @property
     def beyond(self) -> int:
@@ -360,9 +346,9 @@ class SmoothFit:
     def _problem(self, frames: WhitenedFrames, factor: int, u: Tensor) -> VolumeProblem:
         prior = self.plan.prior.weakened(self._strength)
         prior = prior if factor == 1 else prior.on_larger_voxels(factor)
-        prior = replace(prior, levels=self.plan.levels)
+        prior = replace(prior, levels=self.plan.levels.occupancies)
         problem = VolumeProblem(frames, prior, self._level, self.plan.backend)
-        beside = self.plan.absorbed(u.to(problem.device))
+        beside = self.plan.levels.absorbed(u.to(problem.device))
         frames.absorbed = None if beside is None else problem.lines(beside)
         return problem
 
