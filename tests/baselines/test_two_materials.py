@@ -200,7 +200,7 @@ def test_a_cloud_of_two_materials_keeps_them(tmp_path):
     assert both.matter.occupancies
     assert not both.matter.single
     assert both.matter.channels == (SILICA, OIL)
-    assert both.detached().on("reference").matter.second == OIL
+    assert both.detached().on("reference").matter.others == (OIL,)
     write_object(tmp_path / "object.h5", both)
     found = read_object(tmp_path / "object.h5")
     assert isinstance(found, GaussianCloud)
@@ -245,8 +245,6 @@ def test_the_denser_of_two_known_materials_comes_first():
 
 
 def test_materials_that_delta_does_not_tell_apart_are_refused():
-    near = DeltaBeta(0.96 * SILICA.delta, 0.0)
-    assert MaterialPrior.known(OIL, near, SILICA).materials == (SILICA, near, OIL)
     with pytest.raises(InputError, match="told apart by δ, but theirs are"):
         MaterialPrior.known(SILICA, DeltaBeta(SILICA.delta, 0.0))
     with pytest.raises(InputError, match="must all have δ above"):
@@ -382,10 +380,7 @@ def test_two_materials_are_named_on_the_command_line(scan, tmp_path):
     [
         (("--density", 1.1), "--density can only go with --material"),
         (("--delta-beta", 300, "--material", "water"), "give --material or --delta-beta, not both"),
-        (
-            ("--material", "water", "--material", "SiO2", *(3 * ("--density", 1.1))),
-            "for each formula (1), but it is given 3",
-        ),
+        (("--material", "SiO2", *(3 * ("--density", 1.1))), "for each formula (1), but it is given 3"),
         (("--material", "water", "--material", "water"), "told apart"),
     ],
 )

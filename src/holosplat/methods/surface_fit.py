@@ -137,8 +137,8 @@ def cut_surfaces(
         vertices.append(mesh.vertices / unit_length)
         faces.append(mesh.faces + count)
         count += len(mesh.vertices)
-    joined = (torch.from_numpy(np.concatenate(arrays)) for arrays in (vertices, faces))
-    return SurfaceMesh(*joined, unit_length, matter, parts=[len(part) for part in faces])
+    points, triangles = torch.from_numpy(np.concatenate(vertices)), torch.from_numpy(np.concatenate(faces))
+    return SurfaceMesh(points, triangles, unit_length, matter, parts=[len(part) for part in faces])
 
 
 def _levels(occupancy: Tensor, own: Sequence[float], share: float) -> Iterator[np.ndarray | float]:
