@@ -12,13 +12,15 @@ repeated.
 from __future__ import annotations
 
 import argparse
-import csv
 import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+from rows import read as texts
+from rows import write
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
@@ -91,19 +93,8 @@ class Runs:
 
 def read(file: Path | None) -> list[Row]:
     """The rows of a CSV file, numbers as such; none where there is no file."""
-    if file is None or not file.exists():
-        return []
-    with file.open(newline="") as lines:
-        words = ("case", "variant", "commit")
-        return [{k: v if k in words else float(v) for k, v in row.items()} for row in csv.DictReader(lines)]
-
-
-def write(rows: list[Row], file: Path) -> None:
-    """Rows as a CSV file."""
-    with file.open("w", newline="") as lines:
-        writer = csv.DictWriter(lines, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    words = ("case", "variant", "commit")
+    return [{k: v if k in words else float(v) for k, v in row.items()} for row in (texts(file) if file else ())]
 
 
 def shown(row: Row) -> str:

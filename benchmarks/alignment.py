@@ -13,17 +13,17 @@ too (`refined`, as --refine does).
 from __future__ import annotations
 
 import argparse
-import csv
 import platform
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from rows import merge
 from scipy.spatial.transform import Rotation
 
 import holosplat as hs
-from holosplat.align import PoseOptions, Uncertain, align_views
+from holosplat.align import PoseOptions, PosePrior, align_views
 from holosplat.align.gauge import moved_onto
 from holosplat.beamline.declared.case import Case
 from holosplat.beamline.misalignment import Misalignment
@@ -32,7 +32,7 @@ from holosplat.metrics import volume_scores
 from holosplat.version import source_commit
 from holosplat_bench.suite.case import load_case
 
-USUAL = Uncertain()
+USUAL = PosePrior()
 MOMENTS = ("planned", "aligned", "refined", "true")
 FINE = str(Path(__file__).with_name("alignment_fine.toml"))
 """Red cells whose first fringe is 2.5 pixels wide."""
@@ -71,11 +71,11 @@ class Experiment:
     scene: str
     errors: Misalignment
     photons: float | None = None
-    uncertain: Uncertain = USUAL
+    uncertain: PosePrior = USUAL
     held_out: int = 4
     methods: tuple[str, ...] = ()
 
-    def told(self) -> Uncertain:
+    def told(self) -> PosePrior:
         """What `align` is told: distances are as uncertain as they are, and 2 % where all is as planned."""
         return replace(self.uncertain, distance=self.errors.distance or 0.02)
 
@@ -90,7 +90,7 @@ CASES = {
     "1 px, 0.6°": Experiment("main12", Misalignment(1.0, 0.6, 0.02, 0)),
     "1 px, 0.6°, other errors": Experiment("main12", Misalignment(1.0, 0.6, 0.02, 1)),
     "1 px, 0.6°, 4 views": Experiment("main4", Misalignment(1.0, 0.6, 0.02, 0)),
-    "5 px, 1°, 2000 photons": Experiment("main12", Misalignment(5.0, 1.0, 0.05, 1), 2000.0, Uncertain(shift=5.0)),
+    "5 px, 1°, 2000 photons": Experiment("main12", Misalignment(5.0, 1.0, 0.05, 1), 2000.0, PosePrior(shift=5.0)),
     "perfect": Experiment("main12", Misalignment()),
     "perfect, 12 views": Experiment("main12", Misalignment(seed=7), methods=("gaussians",)),
     "perfect, 4 views": Experiment("main4", Misalignment(seed=7), held_out=2, methods=("gaussians",)),
@@ -98,12 +98,12 @@ CASES = {
     "fine pixels, 2000 photons": Experiment(FINE, Misalignment(1.0, 0.6, 0.02, 3), 2000.0),
     "soft cells": Experiment("soft12", Misalignment(1.0, 0.6, 0.02, 4)),
     "1 px, 0.6°, 1 % magnification": Experiment(
-        "main12", Misalignment(1.0, 0.6, 0.0, 0, magnification=0.01), uncertain=Uncertain(magnification=0.01)
+        "main12", Misalignment(1.0, 0.6, 0.0, 0, magnification=0.01), uncertain=PosePrior(magnification=0.01)
     ),
     "1 px, 0.6°, 0.5 % magnification": Experiment(
-        "main12", Misalignment(1.0, 0.6, 0.0, 1, magnification=0.005), uncertain=Uncertain(magnification=0.01)
+        "main12", Misalignment(1.0, 0.6, 0.0, 1, magnification=0.005), uncertain=PosePrior(magnification=0.01)
     ),
-    "perfect, magnification free": Experiment("main12", Misalignment(), uncertain=Uncertain(magnification=0.01)),
+    "perfect, magnification free": Experiment("main12", Misalignment(), uncertain=PosePrior(magnification=0.01)),
     "volume 12": Experiment("main12", Misalignment(1.0, 0.6, 0.02, 7), methods=BOTH),
     "volume 12, other errors": Experiment("main12", Misalignment(1.0, 0.6, 0.02, 8), methods=("auto",)),
     "volume 4": Experiment("main4", Misalignment(1.0, 0.6, 0.02, 7), held_out=2, methods=BOTH),
@@ -213,16 +213,6 @@ def together(scan: hs.Scan, true: hs.Exposures) -> hs.Exposures:
     return replace(scan.exposures, views=replace(views, rotations=rotations, shifts=shifts))
 
 
-def write_rows(name: str, new: list[Row]) -> None:
-    """Put the rows of a case into the table, in place of those that it has."""
-    with TABLE.open(newline="", encoding="utf-8") as file:
-        old = [row for row in csv.DictReader(file) if row["case"] != name]
-    with TABLE.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, FIELDS, restval="", lineterminator="\n")
-        writer.writeheader()
-        writer.writerows([*old, *new])
-
-
 def main() -> None:
     """Run cases; rows of others stay."""
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
@@ -231,8 +221,7 @@ def main() -> None:
     wanted = parser.parse_args()
     commit = source_commit()  # before the table is written, which is part of the tree
     for name in wanted.cases:
-        new = rows_of(name, CASES[name], wanted.moments, commit)
-        write_rows(name, new)
+        merge(rows_of(name, CASES[name], wanted.moments, commit), TABLE, "case", columns=FIELDS)
 
 
 if __name__ == "__main__":

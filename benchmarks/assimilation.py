@@ -11,20 +11,19 @@ assumed is right, or one number of it is wrong: the prior's cost when it is wron
 from __future__ import annotations
 
 import argparse
-import csv
 import platform
 import time
 from collections.abc import Iterator
-from dataclasses import astuple, dataclass, fields, replace
+from dataclasses import asdict, astuple, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from machine import commit
+from rows import write
 from scipy.spatial.transform import Rotation
 
 import holosplat as hs
-from holosplat.io.atomic import atomic_path
 from holosplat.matter import Matter
 from holosplat.mesh import TriangleMesh
 from holosplat.metrics.volumes import normal_distance
@@ -130,10 +129,9 @@ def main() -> None:
     asked, found = parser.parse_args(), []
     for row in rows(asked.seed):
         print(*astuple(row)[:12], sep="; ", flush=True)
-        found.append([f"{v:.5g}" if isinstance(v, float) else str(v) for v in astuple(row)])
+        found.append({name: f"{v:.5g}" if isinstance(v, float) else v for name, v in asdict(row).items()})
     if asked.write:
-        with atomic_path(PAGE) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-            csv.writer(file, lineterminator="\n").writerows([[field.name for field in fields(Row)], *found])
+        write(found, PAGE)
 
 
 if __name__ == "__main__":

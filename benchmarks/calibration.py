@@ -10,13 +10,13 @@ Beads are finer polyhedra than those of the fit. Errors are those after the best
 from __future__ import annotations
 
 import argparse
-import csv
 import platform
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from rows import merge
 from scipy.spatial.transform import Rotation
 
 import holosplat as hs
@@ -133,14 +133,7 @@ def main() -> None:
     parser.add_argument("--cases", nargs="*", default=list(CASES))
     wanted, commit = parser.parse_args(), source_commit()
     for name in wanted.cases:
-        new, old = rows_of(name, CASES[name], commit), []
-        if TABLE.is_file():
-            with TABLE.open(newline="", encoding="utf-8") as file:
-                old = [row for row in csv.DictReader(file) if row["case"] != name]
-        with TABLE.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, FIELDS, lineterminator="\n")
-            writer.writeheader()
-            writer.writerows([*old, *new])
+        merge(rows_of(name, CASES[name], commit), TABLE, "case", columns=FIELDS)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ stand in the table in place of earlier ones of the same scene and kind.
 from __future__ import annotations
 
 import argparse
-import csv
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,10 +21,10 @@ import torch
 import zarr
 from machine import commit
 from numcodecs import Blosc
+from rows import merge
 
 import holosplat as hs
 from holosplat.geometry import Grid
-from holosplat.io.atomic import atomic_path
 from holosplat.io.compact import steps_of
 from holosplat.io.objects import read_object, write_compact
 from holosplat.io.ome_zarr import CHUNK
@@ -102,13 +101,7 @@ def main() -> None:
         made.append(row)
         print(row, flush=True)
     if given.write:
-        old = list(csv.DictReader(OUT.open(newline=""))) if OUT.is_file() else []
-        ours = {(row["scene"], row["kind"]) for row in made}
-        kept = [row for row in old if (row["scene"], row["kind"]) not in ours]
-        with atomic_path(OUT) as path, path.open("w", newline="") as file:
-            table = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-            table.writeheader()
-            table.writerows([*kept, *made])
+        merge(made, OUT, "scene", "kind", columns=COLUMNS)
 
 
 if __name__ == "__main__":

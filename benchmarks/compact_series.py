@@ -11,15 +11,14 @@ the row stands in the table in place of an earlier one of the same name.
 from __future__ import annotations
 
 import argparse
-import csv
 import tempfile
 from pathlib import Path
 
 import numpy as np
 from machine import commit
+from rows import merge
 
 import holosplat as hs
-from holosplat.io.atomic import atomic_path
 from holosplat.io.compact import Steps
 from holosplat.io.objects import read_object, write_compact, write_object
 from holosplat.io.series import names_of, read_series, write_series
@@ -75,11 +74,7 @@ def main() -> None:
     made = row(given.name, objects_of(given.runs))
     print(made)
     if given.write:
-        old = list(csv.DictReader(OUT.open(newline=""))) if OUT.is_file() else []
-        with atomic_path(OUT) as path, path.open("w", newline="") as file:
-            table = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-            table.writeheader()
-            table.writerows([*(r for r in old if r["name"] != given.name), made])
+        merge([made], OUT, "name", columns=COLUMNS)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ photoabsorption what is scattered out of the beam, coherently or not.
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Iterator
 from importlib.metadata import version
@@ -17,8 +16,8 @@ from pathlib import Path
 
 import xraydb
 from machine import commit
+from rows import written
 
-from holosplat.io.atomic import atomic_path
 from holosplat.materials import HAEMOGLOBIN, WATER
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "data" / "delta_beta.csv"
@@ -53,13 +52,11 @@ def henke(formula: str, density: float) -> tuple[float, float]:
 def main() -> None:
     """Write the table."""
     versions = " ".join(f"{name} {version(name)}" for name in ("xraydb", "periodictable"))
-    with atomic_path(OUT) as path, path.open("w", newline="") as file:
-        table = csv.writer(file, lineterminator="\n")
-        table.writerow(COLUMNS)
-        for material, source, absorption, delta, beta in rows():
-            values = (ENERGY_KEV, f"{delta:.5g}", f"{beta:.5g}", f"{delta / beta:.5g}")
-            table.writerow((material, source, absorption, *values, versions, commit()))
-            print(material, source, absorption, *values)
+    found = [
+        (*about, ENERGY_KEV, f"{delta:.5g}", f"{beta:.5g}", f"{delta / beta:.5g}", versions, commit())
+        for *about, delta, beta in rows()
+    ]
+    written(OUT, COLUMNS, (dict(zip(COLUMNS, row)) for row in found))
 
 
 if __name__ == "__main__":

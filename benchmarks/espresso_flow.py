@@ -27,9 +27,8 @@ from holosplat.io.atomic import atomic_path
 from holosplat.io.vtk import read_meshes
 from holosplat.mesh import TriangleMesh
 from holosplat.specimens.flow.channel import Channel
-from holosplat.specimens.flow.integrate import State, Stepper
-from holosplat.specimens.flow.suspension import Medium, Suspension
-from holosplat.specimens.membrane.measures import elongation, shape_change
+from holosplat.specimens.flow.suspension import Medium, State, Stepper, Suspension
+from holosplat.specimens.membrane.geometry import elongation, shape_change
 from holosplat.specimens.membrane.model import Elasticity, Membrane
 from holosplat.specimens.repair import closed
 

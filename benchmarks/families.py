@@ -179,12 +179,12 @@ def make(name: str, seed: int, data: Path | None, path: Path, alone: bool) -> No
         return
     if default is None:
         default = run(name, seed, made, None)
-        replaced(path, default, 4)
+        replaced(path, default, key=4)
         shown(default)
     for choice in _tried(default, alone):
         if choice not in known:
             row = run(name, seed, made, choice)
-            replaced(path, row, 4)
+            replaced(path, row, key=4)
             shown(row)
 
 

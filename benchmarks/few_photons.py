@@ -91,7 +91,7 @@ def main() -> None:
                 continue
             row = row_of(scene, seed, wanted.method, commit)
             shown(row)
-            replaced(wanted.out, row, 4)
+            replaced(wanted.out, row, key=4)
 
 
 if __name__ == "__main__":

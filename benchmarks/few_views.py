@@ -10,7 +10,6 @@ the best motion of the whole object: rms of all views, planned, found, and as `a
 from __future__ import annotations
 
 import argparse
-import csv
 import platform
 import time
 from dataclasses import dataclass, replace
@@ -18,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 from alignment import FINE, Row, rms_errors
+from rows import merge
 from scipy.spatial.transform import Rotation
 
 import holosplat as hs
@@ -115,18 +115,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("--cases", nargs="*", default=list(CASES))
     wanted = parser.parse_args()
-    commit, rows = source_commit(), dict[str, Row]()  # before the table is written, which is part of the tree
-    if TABLE.exists():
-        with TABLE.open(newline="", encoding="utf-8") as file:
-            rows = {row["case"]: dict(row) for row in csv.DictReader(file)}
+    commit = source_commit()  # before the table is written, which is part of the tree
     for name in wanted.cases:
         machine = {"machine": f"{platform.machine()}, one core of two", "commit": commit}
-        rows[name] = row_of(name, CASES[name]) | machine
-        print(rows[name], flush=True)
-        with TABLE.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, list(rows[name]), lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows.values())
+        row = row_of(name, CASES[name]) | machine
+        print(row, flush=True)
+        merge([row], TABLE, "case", columns=list(row))
 
 
 if __name__ == "__main__":

@@ -12,13 +12,13 @@ background (correlated over 120 pixels) and 2 % of grain (3 pixels). Seeds alter
 from __future__ import annotations
 
 import argparse
-import csv
 import platform
 import time
 from pathlib import Path
 
 import numpy as np
 import torch
+from rows import written
 
 import holosplat as hs
 from holosplat.beamline.light import UnevenLight
@@ -90,15 +90,7 @@ def main() -> None:
     count = parser.parse_args().seeds
     torch.set_num_threads(1)
     tasks = [("even", 0), ("noise", 0), *(("uneven", seed) for seed in range(count))]
-    with TABLE.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, FIELDS, lineterminator="\n")
-        writer.writeheader()
-        for method in METHODS:
-            for light, seed in tasks:
-                row = run(light, seed, method)
-                writer.writerow(row)
-                file.flush()
-                print(*row.values(), flush=True)
+    written(TABLE, FIELDS, (run(light, seed, method) for method in METHODS for light, seed in tasks))
 
 
 if __name__ == "__main__":

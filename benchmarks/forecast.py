@@ -14,21 +14,20 @@ forecasts' alone; their case is called `true`.
 from __future__ import annotations
 
 import argparse
-import csv
 import platform
 from collections.abc import Iterator
-from dataclasses import astuple, dataclass, fields, replace
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from machine import commit
+from rows import replaced
 
 import holosplat as hs
 from holosplat.bodies.moments import centroid
 from holosplat.bodies.rest_shape import KnownBody
 from holosplat.geometry import Grid
-from holosplat.io.atomic import atomic_path
 from holosplat.io.objects import read_object, write_object
 from holosplat.matter import Matter
 from holosplat.metrics import image_scores, intensity_range, volume_scores
@@ -187,17 +186,6 @@ def rows_of(
             yield Row(*row, machine, commit())
 
 
-def write(rows: list[Row]) -> None:
-    """Put `rows` in place of those of the same case, window, seed, model and time."""
-    names = [field.name for field in fields(Row)]
-    old = list(csv.reader(PAGE.read_text(encoding="utf-8").splitlines()))[1:] if PAGE.is_file() else []
-    new = [[f"{v:.5g}" if isinstance(v, float) else str(v) for v in astuple(row)] for row in rows]
-    kept = [row for row in old if row[:6] not in [one[:6] for one in new]]
-    with atomic_path(PAGE) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerows([names, *sorted([*kept, *new], key=lambda row: (row[:5], int(row[5])))])
-
-
 def main() -> None:
     """Run, print, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -215,7 +203,7 @@ def main() -> None:
         print(*astuple(row)[:13], sep="; ", flush=True)
         rows.append(row)
     if asked.write:
-        write(rows)
+        replaced(PAGE, *rows, key=6, digits=5)
 
 
 if __name__ == "__main__":

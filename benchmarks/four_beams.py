@@ -12,7 +12,6 @@ benchmarks/real_data.py.
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import platform
 import re
@@ -23,6 +22,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 from real_data import COMMIT, command
+from rows import write
 
 import holosplat as hs
 from holosplat.beamline.light import UnevenLight
@@ -42,10 +42,7 @@ def add(case: str, variant: str, values: dict[str, float]) -> None:
         {"case": case, "variant": variant, "measure": k, "value": f"{v:.4g}", **made_on} for k, v in values.items()
     )
     print(case, variant, {k: float(f"{v:.4g}") for k, v in values.items()}, flush=True)
-    with TABLE.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, FIELDS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    write(rows, TABLE, FIELDS)
 
 
 def said(run: Path, volume: float) -> dict[str, float]:

@@ -1,12 +1,13 @@
 """The GPU's kernels, measured: pairs per second of the splat, forward and backward, its errors; times of the others.
 
     python benchmarks/gpu.py --json
+    python benchmarks/gpu.py --csv docs/data/gpu.csv    # and the steps of step.py, a row each
 
 A pair is a Gaussian and a pixel inside its integer box. 244 000 and 30 000 Gaussians with scales of 1 to 4 px, two
 channels, four views of 512 × 512 px, cut at three standard deviations; times are medians of CUDA events around
 single calls. Errors are largest differences over largest values, against the float64 reference on a part of the cloud
-that it can hold. The others (`others`): surfaces of 16 views, voxels about an axis and in any pose, a step of total
-variation, at 512 × 512 px and 256³ voxels. Needs a CUDA GPU and triton.
+that it can hold. The others (`others`): surfaces of 16 views, 30 000 of the Gaussians on 128³ voxels, voxels about an
+axis and in any pose, a step of total variation, at 512 × 512 px and 256³ voxels. Needs a CUDA GPU and triton.
 """
 
 from __future__ import annotations
@@ -19,9 +20,11 @@ import statistics
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rows
 import torch
 from machine import commit
 from scipy.spatial.transform import Rotation
@@ -29,6 +32,7 @@ from torch import Tensor
 
 CUTOFF, VARIANCE = 3.0, 1 / 12
 CHANNELS = 2
+SEED = 0
 
 Table = dict[str, tuple[float, float]]
 
@@ -49,11 +53,11 @@ CASES = (Sizes(244_000), Sizes(30_000))
 
 def cloud(sizes: Sizes, device: str) -> tuple[list[Tensor], tuple[Tensor, Tensor]]:
     """Random Gaussians over the field of view, and random views, all on the device."""
-    r = torch.Generator().manual_seed(0)
+    r = torch.Generator().manual_seed(SEED)
     centres = (torch.rand(sizes.count, 3, generator=r) - 0.5) * sizes.side
     scales = 1 + 3 * torch.rand(sizes.count, 3, generator=r)
     others = [torch.randn(sizes.count, width, generator=r) for width in (4, CHANNELS)]
-    rotations = torch.from_numpy(Rotation.random(sizes.views, rng=0).as_matrix())
+    rotations = torch.from_numpy(Rotation.random(sizes.views, rng=SEED).as_matrix())
     poses = (rotations, torch.zeros(sizes.views, 2, dtype=torch.float64))
     return [a.to(device) for a in (centres, scales, *others)], (poses[0].to(device), poses[1].to(device))
 
@@ -144,14 +148,16 @@ def others(side: int, edge: int, device: str, time: Callable[[Callable[[], Any],
     """
     import holosplat as hs
     from holosplat.baselines.tv_steps import cuda as steps
+    from holosplat.projectors.splat import voxelise
     from holosplat.projectors.surface import surface_thickness
     from holosplat.projectors.voxels import LatticeProjector, SliceProjector
     from holosplat.specimens.phantoms import unit_ball
 
     found, repeats = Table(), 10
-    ball, faces = unit_ball(max(2, round(math.log2(side)) - 1))
+    ball, faces = unit_ball(max(2, round(math.log2(side)) - 2))
     points = torch.from_numpy(0.4 * side * ball).to(device).requires_grad_()
-    poses = tuple(torch.from_numpy(a).to(device) for a in (Rotation.random(16, rng=0).as_matrix(), np.zeros((16, 2))))
+    turns = Rotation.random(16, rng=SEED).as_matrix()
+    poses = tuple(torch.from_numpy(a).to(device) for a in (turns, np.zeros((16, 2))))
     corners = torch.tensor(faces, device=device)
 
     def draw_surface() -> Tensor:
@@ -161,6 +167,16 @@ def others(side: int, edge: int, device: str, time: Callable[[Callable[[], Any],
     found[f"surfaces, {len(faces)} triangles"] = (
         1e3 * time(draw_surface, repeats),
         1e3 * time(lambda: torch.autograd.grad(image, points, image, retain_graph=True), repeats),
+    )
+    arrays = [a.requires_grad_() for a in cloud(Sizes(30_000, side=edge // 2), device)[0]]
+
+    def draw_volume() -> Tensor:
+        return voxelise(*arrays, (edge // 2,) * 3, backend="cuda", trusted=True)
+
+    samples = draw_volume()
+    found[f"{len(arrays[0])} Gaussians on {edge // 2}³ voxels"] = (
+        1e3 * time(draw_volume, repeats),
+        1e3 * time(lambda: torch.autograd.grad(samples, arrays, samples, retain_graph=True), repeats),
     )
     views = hs.Views.evenly_spaced(16, (edge, edge), 1.0)
     grid = hs.Grid.of_views(views)
@@ -194,10 +210,27 @@ def origin() -> dict[str, str]:
     }
 
 
+def written(cases: list[dict[str, Any]], rest: Table, steps: dict[str, float], path: Path) -> None:
+    """Rows in a CSV file: what was computed, which way, its time [ms], rate [pairs/s] and largest error."""
+    about = {name: value for name, value in origin().items() if name != "numpy"} | {"seed": SEED}
+    found: list[tuple[str, str, float, float | str, float | str]] = []
+    for c in cases:
+        for way in ("forward", "backward", "backward_with_poses"):
+            rate, error = c.get(f"{way}_pairs_per_s", ""), max(c["errors"].values()) if way == "forward" else ""
+            found.append((f"splat of {c['gaussians']} Gaussians", way.replace("_", " "), c[f"{way}_ms"], rate, error))
+    for name, (forward, backward) in rest.items():
+        found += [(name, "forward", forward, "", ""), (name, "backward", backward, "", "")]
+    found += [(name.replace("step_ms_", "step of "), "all", time, "", "") for name, time in steps.items()]
+    columns = ("what", "way", "ms", "pairs_per_s", "error")
+    digits = [[f"{x:.4g}" if isinstance(x, float) else x for x in one] for one in found]
+    rows.write([dict(zip(columns, one)) | about for one in digits], path)
+
+
 def main() -> None:
     """Measure all cases and print them."""
     parser = argparse.ArgumentParser(description="Speed and errors of the GPU's splat.")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a Markdown table")
+    parser.add_argument("--csv", type=Path, help="also measure steps, and write all to this file")
     options = parser.parse_args()
     if importlib.util.find_spec("triton") is None:
         sys.exit("This benchmark needs triton, which is not installed (pip install 'holosplat[gpu]').")
@@ -205,6 +238,10 @@ def main() -> None:
         sys.exit("This benchmark needs a CUDA GPU, and torch sees none.")
     cases = [measure(sizes, "cuda") for sizes in CASES]
     rest = others(512, 256, "cuda")
+    if options.csv:
+        from step import on_gpu
+
+        written(cases, rest, on_gpu(), options.csv)
     report = {**origin(), "cases": cases, "others_ms": rest}
     if options.json:
         print(json.dumps(report, indent=2))

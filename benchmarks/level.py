@@ -9,15 +9,14 @@ Matter and noise are those of `benchmarks/mass.py`.
 from __future__ import annotations
 
 import argparse
-import csv
 import itertools
 import platform
-import sys
 from pathlib import Path
 
 import torch
 from machine import commit
 from mass import CASES
+from rows import written
 
 from holosplat.baselines.material import estimate_delta
 from holosplat.methods import Task
@@ -47,12 +46,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    with options.out.open("w", newline="") if options.out else sys.stdout as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        for count, noise, name, seed in itertools.product(options.views, options.noise, options.cases, options.seeds):
-            writer.writerow(row(name, seed, count, noise))
-            file.flush()
+    wanted = itertools.product(options.views, options.noise, options.cases, options.seeds)
+    written(options.out, COLUMNS, (row(name, seed, count, noise) for count, noise, name, seed in wanted))
 
 
 if __name__ == "__main__":

@@ -9,11 +9,13 @@ volume predicts unseen views better than a flat one (`methods.levels`), the stan
 from __future__ import annotations
 
 import argparse
-import csv
+import itertools
 import math
 import os
 import time
 from pathlib import Path
+
+from rows import written
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
@@ -53,15 +55,8 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="+", type=int, default=[101])
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
-    with options.out.open("w", newline="") as file:
-        table = csv.DictWriter(file, COLUMNS)
-        table.writeheader()
-        for name in options.cases:
-            for seed in options.seeds:
-                for row in rows(name, seed):
-                    table.writerow(row)
-                    print(row, flush=True)
-                file.flush()
+    scenes = itertools.product(options.cases, options.seeds)
+    written(options.out, COLUMNS, (row for scene in scenes for row in rows(*scene)))
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ beside them the processor time of the threads that draw and send updates. With -
 from __future__ import annotations
 
 import argparse
-import csv
 import shutil
 import subprocess
 import sys
@@ -23,9 +22,9 @@ from pathlib import Path
 from typing import Any
 
 from machine import commit
+from rows import merge
 
 import holosplat as hs
-from holosplat.io.atomic import atomic_path
 from holosplat.io.formats import read_as
 from holosplat.io.reading import Part, Reading
 from holosplat.show.server import HOST, LiveView
@@ -149,11 +148,7 @@ def main() -> None:
         rows.append(about | {"steps": timed.steps, "gaussians": count, "updates": updates} | times)
         print(rows[-1], flush=True)
     if given.write:
-        old = list(csv.DictReader(OUT.open(newline=""))) if OUT.is_file() else []
-        with atomic_path(OUT) as path, path.open("w", newline="") as file:
-            table = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-            table.writeheader()
-            table.writerows([*old, *rows])
+        merge(rows, OUT, columns=COLUMNS)
 
 
 if __name__ == "__main__":

@@ -11,16 +11,16 @@ total, and how many standard errors the total is off.
 from __future__ import annotations
 
 import argparse
-import csv
 import itertools
 import math
 import os
 import platform
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+
+from rows import written
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
@@ -162,14 +162,9 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     here = {"commit": commit(), "machine": platform.machine()}
-    with options.out.open("w", newline="") if options.out else sys.stdout as file:
-        writer = csv.DictWriter(file, [*COLUMNS, *here])
-        writer.writeheader()
-        for count, known, noise, name, seed in itertools.product(
-            options.views, options.priors, options.noise, options.cases, options.seeds
-        ):
-            writer.writerow({**row(name, seed, count, noise, known), **here})
-            file.flush()
+    wanted = itertools.product(options.views, options.priors, options.noise, options.cases, options.seeds)
+    made = ({**row(name, seed, count, noise, known), **here} for count, known, noise, name, seed in wanted)
+    written(options.out, [*COLUMNS, *here], made)
 
 
 if __name__ == "__main__":

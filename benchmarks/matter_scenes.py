@@ -187,7 +187,7 @@ def main() -> None:
         there = {(row.kind, row.size, row.run, row.seed) for row in rows_of(options.out)}
         if (kind, size, how, seed) not in there:
             row = run(kind, size, how, seed, scene(kind, size, seed))
-            replaced(options.out, row, 4)
+            replaced(options.out, row, key=4)
             shown(row)
     if options.summary:
         for row in rows_of(options.out):

@@ -83,7 +83,7 @@ def main() -> None:
             continue
         with tempfile.TemporaryDirectory() as folder:
             row = run(case, options.data, Path(folder))
-        replaced(options.out, row, 1)
+        replaced(options.out, row, key=1)
         shown(row)
 
 

@@ -13,10 +13,9 @@ to docs/data/motion_ablation.csv.
 from __future__ import annotations
 
 import argparse
-import csv
 import platform
 import time
-from dataclasses import astuple, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 
@@ -24,13 +23,13 @@ import numpy as np
 import torch
 from espresso_flow import Run
 from machine import commit, memory_megabytes
+from rows import replaced, shown
 from scipy.spatial.transform import Rotation
 
 import holosplat as hs
 from holosplat.bodies.moments import centroid, second_moments
 from holosplat.bodies.rest_shape import KnownBody
 from holosplat.geometry import Grid
-from holosplat.io.atomic import atomic_path
 from holosplat.mesh import TriangleMesh
 from holosplat.metrics import volume_scores
 from holosplat.motion.fit import MotionFit
@@ -245,17 +244,6 @@ def row_of(case: str, data: Path, first: int, times: int, every: int, seed: int,
     return Row(case, times, first, every, seed, without, *said, *seconds, memory, machine, commit())  # pyright: ignore[reportCallIssue]
 
 
-def write(rows: list[Row], page: Path) -> None:
-    """Put `rows` in place of those of the same case, times, seed and priors."""
-    names = [field.name for field in fields(Row)]
-    old = list(csv.reader(page.read_text(encoding="utf-8").splitlines()))[1:] if page.is_file() else []
-    new = [[f"{v:.5g}" if isinstance(v, float) else str(v) for v in astuple(row)] for row in rows]
-    kept = [row for row in old if row[:6] not in [one[:6] for one in new]]
-    with atomic_path(page) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerows([names, *sorted([*kept, *new])])
-
-
 def main() -> None:
     """Run, print, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -271,9 +259,9 @@ def main() -> None:
     chosen = ["none"] if asked.ablation is None else asked.ablation or PRIORS
     for case, without in product(asked.cases, chosen):
         row = row_of(case, asked.data, asked.first, asked.times, asked.every, asked.seed, without)
-        print(*(f"{field.name} {getattr(row, field.name)}" for field in fields(Row)), sep="; ", flush=True)
+        shown(row)
         if asked.write:
-            write([row], PAGE if asked.ablation is None else ABLATION)
+            replaced(PAGE if asked.ablation is None else ABLATION, row, key=6, digits=5)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@
 Four views evenly over 180°, 64 × 64 pixels of 0.5 µm, 20 keV, 10 cm, known material (δ = 6e-7, δ/β = 1000).
 stir4: a stirred soft blob whose middle turns by 60°, 1000 photons a pixel. foam4: a collapsing foam that loses half of
 its gas, likewise. burst4: the blob as it turns by 6°, at 16 times of 200 photons, beside one time of 3200 photons.
-fade4: the stirred blob as it loses half of its δ, with and without `CarriedOptions.fading`.
+fade4: the stirred blob as it loses half of its δ, with and without `FlowOptions.fading`.
 Errors of δ are those of the whole volume at every time (‖δ - δ₀‖ / ‖δ₀‖), their mean and the largest. Opponents: each
 time by itself, by the method of continuous matter, and the mean of all times. The simulation moves matter by maps in
 closed form, and shares no numerics with the fit. With --write, rows stand in the file in place of earlier ones of the
@@ -27,7 +27,7 @@ import holosplat as hs
 from holosplat.geometry import Grid
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import SmoothVolume
-from holosplat.motion.flow_reconstruction import CarriedOptions, merged
+from holosplat.motion.flow_reconstruction import FlowOptions, merged
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.carried import CarriedScene, Fades
 from holosplat.workflows.moving import reconstruct_moving
@@ -114,7 +114,7 @@ class Case:
         told = (float(wrong.mean()), float(wrong.max()), *spent.told(), rows.machine(), commit(), said)
         return Row(self.name, method, len(self.times), self.seed, *told)
 
-    def together(self, options: CarriedOptions) -> tuple[Callable[[float], hs.volume.Object], str]:
+    def together(self, options: FlowOptions) -> tuple[Callable[[float], hs.volume.Object], str]:
         """All times in one: `reconstruct --time-frame all`."""
         found = reconstruct_moving(self.scan, PRIOR, options)
         if found is None:
@@ -142,10 +142,10 @@ class Case:
 def rows_of(case: Case) -> list[Row]:
     """Those of every method that the case asks for."""
     middle = case.times[[len(case.times) // 2]]
-    usual = CarriedOptions(sources=case.name == "foam4")
+    usual = FlowOptions(sources=case.name == "foam4")
     found = [case.row("all times in one", lambda: case.together(usual), case.times)]
     if case.name == "fade4":
-        fading = CarriedOptions(fading=FADING)
+        fading = FlowOptions(fading=FADING)
         found.append(case.row("all times in one, fading", lambda: case.together(fading), case.times))
     if case.name == "burst4":
         return [*found, case.row("one time of all photons", case.bright, middle)]

@@ -10,7 +10,6 @@ Iterations are few, for arrays are as large in the first as in the last. Wanted:
 from __future__ import annotations
 
 import argparse
-import csv
 import os
 import platform
 import subprocess
@@ -20,6 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import machine
+from rows import read, write
 
 from holosplat.beamline.simulate import SIMULATED_FRINGE_SAMPLES
 from holosplat.geometry import Views
@@ -134,8 +134,7 @@ def compared(job: Job, measured: float) -> dict[str, object]:
 
 def again(path: Path) -> list[dict[str, object]]:
     """The table with the same measurements and estimates made anew."""
-    with path.open() as file:
-        rows = [dict[str, object](row) for row in csv.DictReader(file)]
+    rows = read(path)
     for row in rows:
         sizes = (int(str(row[name])) for name in ("rows", "columns", "views"))
         job = Job(str(row["method"]), *sizes, float(str(row["pixel"])))
@@ -150,7 +149,7 @@ def main() -> None:
     parser.add_argument("--again", action="store_true", help="estimates anew, beside the measurements of the table")
     given, rows = parser.parse_args(), list[dict[str, object]]()
     if given.again:
-        write(given.csv, again(given.csv))
+        write(again(given.csv), given.csv)
         return
     if given.csv and given.csv.exists():  # what is there is kept, so that a table may grow
         rows = again(given.csv)
@@ -161,15 +160,7 @@ def main() -> None:
         rows.append(row(job) | {"machine": f"{os.cpu_count()} × {platform.machine()}", "commit": machine.commit()})
         print(rows[-1], flush=True)
         if given.csv:
-            write(given.csv, rows)
-
-
-def write(path: Path, rows: list[dict[str, object]]) -> None:
-    """The table."""
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+            write(rows, given.csv)
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ from holosplat.learning.network import Size
 from holosplat.mesh import TriangleMesh
 from holosplat.methods import METHODS, Gaussians, Pinn, SurfaceOptions
 from holosplat.motion.fit import MotionFit
-from holosplat.motion.flow_reconstruction import CarriedOptions
+from holosplat.motion.flow_reconstruction import FlowOptions
 from holosplat.motion.track_options import TrackOptions
 from holosplat.planning import acts
 from holosplat.planning.needs import Needs, of_reconstruction
@@ -43,7 +43,7 @@ from holosplat.specimens.red_cells import random_cells
 from holosplat.training.ranges import Ranges
 from holosplat_bench.suite.case import planned_frames
 from holosplat_bench.suite.methods import METHODS as BENCH_METHODS
-from holosplat_bench.suite.needs import of_methods
+from holosplat_bench.suite.methods import of_methods
 
 PIXEL, STEP = 3.2e-6, 1e-4
 """Of frames [m], and between two times [s]."""
@@ -260,7 +260,7 @@ ACTS: dict[str, tuple[Callable[[Path, Sizes], list[object]], Callable[[Sizes], N
     "track": (track, lambda sizes: acts.of_track(frames(sizes), TrackOptions())),
     "forecast": (forecast, lambda sizes: acts.of_forecast(frames(sizes), MotionFit().schedule.views_per_step)),
     "align": (align, lambda sizes: acts.of_alignment(frames(sizes), PoseOptions())),
-    "matter in motion": (moving, lambda sizes: acts.of_motion(frames(sizes), CarriedOptions())),
+    "matter in motion": (moving, lambda sizes: acts.of_motion(frames(sizes), FlowOptions())),
     "pinn": (pinn, lambda sizes: acts.of_space_time(frames(sizes), Pinn())),
     "each time": (each, said_of_method("gaussians")),
     "surface": (surface, lambda sizes: acts.of_surfaces(frames(sizes), SurfaceOptions())),

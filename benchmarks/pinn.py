@@ -19,21 +19,20 @@ in the file in place of earlier ones of the same case, views, equations and seed
 from __future__ import annotations
 
 import argparse
-import csv
 import platform
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import astuple, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 
 import numpy as np
 import torch
 from machine import commit
+from rows import replaced, shown
 
 import holosplat as hs
 from holosplat.geometry import Grid
-from holosplat.io.atomic import atomic_path
 from holosplat.mesh import TriangleMesh
 from holosplat.methods import Pinn, Task
 from holosplat.methods.illumination import prepared
@@ -186,17 +185,6 @@ def rows_of(case: str, views: int, seed: int, chosen: list[str], data: Path | No
         yield row(name, found, time.process_time() - began, name != "none")
 
 
-def write(row: Row) -> None:
-    """Put `row` in place of that of the same case, views, equations and seed."""
-    names = [field.name for field in fields(Row)]
-    old = list(csv.reader(PAGE.read_text(encoding="utf-8").splitlines()))[1:] if PAGE.is_file() else []
-    new = [f"{v:.4g}" if isinstance(v, float) else str(v) for v in astuple(row)]
-    kept = [one for one in old if one[:4] != new[:4]]
-    with atomic_path(PAGE) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerows([names, *sorted([*kept, new])])
-
-
 def main() -> None:
     """Run, print, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -212,9 +200,9 @@ def main() -> None:
     for case, seed, views in product(asked.cases, asked.seeds, asked.views):
         data = asked.data if case == "espresso" else None
         for row in rows_of(case, views, seed, asked.equations, data):
-            print(*(f"{field.name} {getattr(row, field.name)}" for field in fields(Row)), sep="; ", flush=True)
+            shown(row)
             if asked.write:
-                write(row)
+                replaced(PAGE, row, key=4)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ docs/images/real_data.
 from __future__ import annotations
 
 import argparse
-import csv
 import platform
 import shlex
 import subprocess
@@ -23,6 +22,7 @@ from functools import partial
 from pathlib import Path
 
 import matplotlib
+from rows import merge
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -62,17 +62,7 @@ def command(text: str, cwd: Path) -> str:
 
 def write_rows(rows: list[dict[str, object]]) -> None:
     """Put rows into the table, in the place of those of the same case, method and measure."""
-    old = []
-    if TABLE.is_file():
-        with TABLE.open(newline="", encoding="utf-8") as file:
-            old = list(csv.DictReader(file))
-    new = {(row["case"], row["method"], row["measure"]) for row in rows}
-    kept = [row for row in old if (row["case"], row["method"], row["measure"]) not in new]
-    TABLE.parent.mkdir(parents=True, exist_ok=True)
-    with TABLE.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, FIELDS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows([*kept, *rows])
+    merge(rows, TABLE, "case", "method", "measure", columns=FIELDS)
 
 
 def row(case: str, method: str, scores: dict[str, float], seconds: float) -> list[dict[str, object]]:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import csv
 import platform
+import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,15 +16,16 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 
-def written(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, str]]) -> None:
-    """A CSV file of `rows`, each written and printed as soon as it is there."""
-    with path.open("w", newline="") as file:
+def written(path: Path | None, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
+    """A CSV file of `rows`, each written and printed as soon as it is there; without a path they are printed as one."""
+    with path.open("w", newline="") if path else nullcontext(sys.stdout) as file:
         table = csv.DictWriter(file, columns, lineterminator="\n")
         table.writeheader()
         for row in rows:
             table.writerow(row)
-            print(row, flush=True)
             file.flush()
+            if path:
+                print(row, flush=True)
 
 
 def read(path: Path) -> list[dict[str, Any]]:
@@ -35,23 +37,34 @@ def read(path: Path) -> list[dict[str, Any]]:
 
 
 def write(rows: Sequence[Mapping[str, Any]], path: Path, columns: Sequence[str] = ()) -> None:
-    """A CSV file of all rows; columns: those of the first row unless they are given."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        table = csv.DictWriter(file, columns or list(rows[0]), lineterminator="\n")
+    """A CSV file of all rows; columns: those of the first row unless they are given, empty where a row has none."""
+    from holosplat.io.atomic import atomic_path
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        table = csv.DictWriter(file, columns or list(rows[0]), restval="", lineterminator="\n")
         table.writeheader()
         table.writerows(rows)
 
 
-def replaced(path: Path, row: DataclassInstance, key: int, digits: int = 4) -> None:
-    """The CSV file of such rows with `row` in place of that whose first `key` fields are the same, in order."""
-    from holosplat.io.atomic import atomic_path
+def merge(rows: Sequence[Mapping[str, Any]], path: Path, *key: str, columns: Sequence[str] = ()) -> None:
+    """The CSV file with `rows` after those of it that have other values of `key`; after all of it without a key."""
+    new = {tuple(str(row[name]) for name in key) for row in rows}
+    kept = [row for row in read(path) if not key or tuple(row[name] for name in key) not in new]
+    write([*kept, *rows], path, columns)
 
-    new = [f"{value:.{digits}g}" if isinstance(value, float) else str(value) for value in astuple(row)]
-    old = list(csv.reader(path.read_text(encoding="utf-8").splitlines()))[1:] if path.is_file() else []
-    kept = [one for one in old if one[:key] != new[:key]]
-    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        table = csv.writer(file, lineterminator="\n")
-        table.writerows([[field.name for field in fields(row)], *sorted([*kept, new])])
+
+def replaced(path: Path, *rows: DataclassInstance, key: int, digits: int = 4) -> None:
+    """The CSV file of such rows with `rows` in place of those whose first `key` fields are the same, in order."""
+    names = [field.name for field in fields(rows[0])]
+    cells = [[f"{v:.{digits}g}" if isinstance(v, float) else str(v) for v in astuple(row)] for row in rows]
+    kept = [one for old in read(path) if (one := list(old.values()))[:key] not in [new[:key] for new in cells]]
+    write([dict(zip(names, one)) for one in sorted([*kept, *cells], key=_order)], path, names)
+
+
+def _order(cells: Sequence[str]) -> list[tuple[float, str]]:
+    """By what rows are sorted: numbers by their values."""
+    return [(float(cell), "") if cell.replace(".", "", 1).isdigit() else (-1.0, cell) for cell in cells]
 
 
 def shown(row: DataclassInstance) -> None:

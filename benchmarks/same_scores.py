@@ -8,11 +8,11 @@ python benchmarks/same_scores.py bench --out docs/data/redesign.csv
 from __future__ import annotations
 
 import argparse
-import csv
 from pathlib import Path
 
-from holosplat_bench.suite.folder import BenchFolder
-from holosplat_bench.suite.rows import read_row
+from rows import read, write
+
+from holosplat_bench.suite.folder import BenchFolder, read_row
 
 COMMITTED = Path(__file__).parents[1] / "docs" / "data" / "benchmark.csv"
 SCORES = ("ssim", "frcm", "dice", "relative_error_delta")
@@ -20,8 +20,7 @@ SCORES = ("ssim", "frcm", "dice", "relative_error_delta")
 
 def compared(bench: Path, committed: Path = COMMITTED) -> list[dict[str, str | float]]:
     """For every row of `bench` that the table has too: its scores, and how much each differs from the table's."""
-    with committed.open(newline="") as file:
-        table = {(row["case"], row["seed"], row["method"]): row for row in csv.DictReader(file)}
+    table = {(row["case"], row["seed"], row["method"]): row for row in read(committed)}
     found = []
     for path in sorted(BenchFolder(bench).rows.glob("*.json")):
         row = read_row(path)
@@ -44,10 +43,7 @@ def main(bench: Path, out: Path | None) -> None:
     largest = max((abs(float(row[f"{name}_change"])) for row in rows for name in SCORES), default=float("nan"))
     print(f"{len(rows)} rows; the largest change is {largest:.1e}")
     if out is not None and rows:
-        with out.open("w", newline="") as file:
-            writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-            writer.writeheader()
-            writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows)
+        write([{k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows], out)
 
 
 if __name__ == "__main__":

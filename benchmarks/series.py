@@ -21,7 +21,6 @@ CPU seconds are those of the processes alone, user and system.
 from __future__ import annotations
 
 import argparse
-import csv
 import os
 import platform
 import random
@@ -34,6 +33,8 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+
+from rows import merge
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # of processes begun here: from the second run on, users have bytecode
@@ -54,9 +55,8 @@ from holosplat.mesh import TriangleMesh
 from holosplat.methods import Method
 from holosplat.methods.presets import preset
 from holosplat.metrics import volume_scores
-from holosplat.series.folder import SeriesFolder
+from holosplat.series.folder import Row, SeriesFolder
 from holosplat.series.plan import plan_series
-from holosplat.series.rows import Row
 from holosplat.series.run import PROGRAM, states
 from holosplat.series.settings import Cut, Settings, Warm
 from holosplat.series.task import run_task
@@ -313,18 +313,7 @@ def main() -> None:
         for row in rows:
             print(*row[:3], sep=": ", flush=True)
         if given.csv:
-            keep(given.csv, case, rows)
-
-
-def keep(path: Path, case: str, rows: list[tuple]) -> None:
-    """Put the rows of a case in the place of earlier ones."""
-    old = []
-    if path.is_file():
-        with path.open(newline="", encoding="utf-8") as file:
-            old = [row for row in list(csv.reader(file))[1:] if row[0] != case]
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerows([COLUMNS, *old, *rows])
+            merge([dict(zip(COLUMNS, row)) for row in rows], given.csv, "case", columns=COLUMNS)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,8 @@ import time
 from dataclasses import dataclass, replace
 
 import numpy as np
-from alignment import Row, rms_errors, write_rows
+from alignment import FIELDS, TABLE, Row, rms_errors
+from rows import merge
 from scipy.spatial.transform import Rotation
 
 import holosplat as hs
@@ -160,7 +161,7 @@ def main() -> None:
     commit = source_commit()  # before the table is written, which is part of the tree
     for name in wanted.cases:
         new = rows_of(name, CASES[name], wanted.times, wanted.moments, commit)
-        write_rows(name, new)
+        merge(new, TABLE, "case", columns=FIELDS)
 
 
 if __name__ == "__main__":

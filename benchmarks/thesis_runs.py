@@ -15,7 +15,6 @@ curves of each run, and for the pictures the maps of the studies of seed 0.
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import os
 import subprocess
@@ -28,11 +27,11 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
+from rows import read, write
 
 from holosplat.io.atomic import atomic_path
-from holosplat_bench.thesis.configurations import BESIDE, DECLARED, EVERY, EXTRA, PACES, THESIS_TABLE
+from holosplat_bench.thesis.configurations import BESIDE, DECLARED, EVERY, EXTRA, PACES, PHYSICS, THESIS_TABLE
 from holosplat_bench.thesis.folder import CURVES, StudyFolder
-from holosplat_bench.thesis.measured import PHYSICS
 
 DATA = Path(__file__).resolve().parents[1] / "docs" / "data" / "thesis_study"
 SMALL = [c.name for c in THESIS_TABLE if c.count == THESIS_TABLE[0].count]
@@ -87,10 +86,7 @@ def finished(runs: Path, task: Task) -> bool:
 
 def collected() -> dict[tuple[str, ...], dict[str, str]]:
     """The rows of runs.csv, by what names their runs."""
-    if not (DATA / "runs.csv").exists():
-        return {}
-    with (DATA / "runs.csv").open(newline="") as file:
-        return {tuple(row[key] for key in IDENTITY): row for row in csv.DictReader(file)}
+    return {tuple(row[key] for key in IDENTITY): row for row in read(DATA / "runs.csv")}
 
 
 def known(task: Task) -> tuple[str, ...]:
@@ -165,12 +161,8 @@ def rows(runs: Path) -> Iterator[dict[str, object]]:
 
 def collect(runs: Path) -> None:
     """Write runs.csv, the curves, and the maps for the pictures."""
-    DATA.mkdir(exist_ok=True)
     found = list(rows(runs))
-    with atomic_path(DATA / "runs.csv") as path, path.open("w", newline="") as file:
-        table = csv.DictWriter(file, list(found[0]), lineterminator="\n")
-        table.writeheader()
-        table.writerows(found)
+    write(found, DATA / "runs.csv")
     for task in tasks():
         if not finished(runs, task):
             continue

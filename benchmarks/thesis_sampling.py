@@ -10,18 +10,17 @@ beside those with 12: root mean square of the difference over that of the contra
 from __future__ import annotations
 
 import argparse
-import csv
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from machine import commit
+from rows import written
 
 from holosplat.beamline.declared.case import Case
-from holosplat.io.atomic import atomic_path
 from holosplat.model import Instrument
 from holosplat_bench.suite.case import load_case
-from holosplat_bench.thesis.measured import PHYSICS
+from holosplat_bench.thesis.configurations import PHYSICS
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "data" / "thesis_study" / "sampling.csv"
 SAMPLES, FINEST = (1, 2, 3, 4, 6, 8), 12
@@ -58,12 +57,8 @@ def main() -> None:
     parser.add_argument("--snapshots", type=Path, required=True)
     case = load_case("thesis16", 0, parser.parse_args().snapshots)
     rows = [*(row for physics in ("declared", "far") for row in waves(case, physics)), *angles(case)]
-    with atomic_path(OUT) as path, path.open("w", newline="") as file:
-        table = csv.writer(file, lineterminator="\n")
-        table.writerow(("what", "of", "count", "value", "seed", "commit"))
-        for what, of, count, value in rows:
-            table.writerow((what, of, count, f"{value:.4g}", case.seed, commit()))
-            print(what, of, count, f"{value:.4g}")
+    columns = ("what", "of", "count", "value", "seed", "commit")
+    written(OUT, columns, (dict(zip(columns, (*row, f"{value:.4g}", case.seed, commit()))) for *row, value in rows))
 
 
 if __name__ == "__main__":

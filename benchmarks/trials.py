@@ -10,7 +10,6 @@ Markdown table: SSIM / FRCM of noise-free held-out frames, Dice / relative error
 from __future__ import annotations
 
 import argparse
-import csv
 import os
 import time
 from collections.abc import Callable, Mapping
@@ -18,6 +17,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+from rows import write
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
@@ -308,10 +309,7 @@ def main() -> None:
                 )
                 print(f"| {name} | {seed} | {trial} | {images} | {volume} | {seconds:.0f} |", flush=True)
     if options.csv:
-        with options.csv.open("w", newline="") as file:
-            writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
+        write(rows, options.csv)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ ratio to that of the defaults on each scene, Dice, and SSIM / FRCM of noise-free
 from __future__ import annotations
 
 import argparse
-import csv
 import os
 import sys
 import time
@@ -19,6 +18,8 @@ from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
+
+from rows import write
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
@@ -143,10 +144,7 @@ def main() -> None:
         for seed in chosen.seeds:
             rows += scored(load_case(name, seed, None), chosen.methods, chosen.options)
             if chosen.csv:  # after every scene, for there is an hour to lose
-                with chosen.csv.open("w", newline="") as file:
-                    writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-                    writer.writeheader()
-                    writer.writerows(rows)
+                write(rows, chosen.csv)
     for method in chosen.methods:
         print(f"\n{method}\n", *table(rows, method), sep="\n")
     print(f"\nCommit {commit()}, torch {torch.__version__}, {torch.get_num_threads()} threads.")

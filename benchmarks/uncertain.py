@@ -9,10 +9,12 @@ the truth. Seed 7 served to choose the rules of `methods.uncertain`; reported ar
 from __future__ import annotations
 
 import argparse
-import csv
+import itertools
 import os
 import time
 from pathlib import Path
+
+from rows import written
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
@@ -65,16 +67,8 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="+", type=int, default=[101])
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
-    with options.out.open("w", newline="") as file:
-        table = csv.DictWriter(file, COLUMNS)
-        table.writeheader()
-        for name in options.cases:
-            for seed in options.seeds:
-                for question in options.questions:
-                    for row in rows(name, seed, question):
-                        table.writerow(row)
-                        print(row, flush=True)
-                file.flush()
+    wanted = itertools.product(options.cases, options.seeds, options.questions)
+    written(options.out, COLUMNS, (row for one in wanted for row in rows(*one)))
 
 
 if __name__ == "__main__":

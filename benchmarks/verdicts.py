@@ -10,13 +10,13 @@ contrast, over the noise, and over what a residual may have (root mean squares).
 from __future__ import annotations
 
 import argparse
-import csv
 import os
 import platform
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+
+from rows import written
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
@@ -122,15 +122,9 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="+", type=int, default=[101])
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
-    rows, here = [], {"commit": commit(), "machine": platform.machine()}
-    for name in options.cases:
-        for seed in options.seeds:
-            rows.append({**row(name, seed), **here})
-            print(rows[-1], file=sys.stderr, flush=True)
-    with options.out.open("w", newline="") if options.out else sys.stdout as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    here = {"commit": commit(), "machine": platform.machine()}
+    rows = [{**row(name, seed), **here} for name in options.cases for seed in options.seeds]
+    written(options.out, list(rows[0]), rows)
 
 
 if __name__ == "__main__":

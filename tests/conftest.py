@@ -134,7 +134,9 @@ def gpu(monkeypatch: pytest.MonkeyPatch) -> torch.device:
     """Where Triton's kernels run: on the GPU or, without one, in Triton's interpreter on the CPU."""
     if not TRITON:
         pytest.skip("triton is not installed")
-    if not GPU:
+    if GPU:
+        monkeypatch.setattr(torch.cuda, "is_available", lambda: True)  # hidden where a test asks for this late
+    else:
         monkeypatch.setenv("TRITON_INTERPRET", "1")
     return torch.device("cuda" if GPU else "cpu")
 
@@ -142,7 +144,7 @@ def gpu(monkeypatch: pytest.MonkeyPatch) -> torch.device:
 @pytest.fixture(autouse=True)
 def _on_the_cpu(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """The backend `auto` means the CPU in tests that do not ask for a GPU: their results are the same everywhere."""
-    if GPU and "gpu" not in request.fixturenames:
+    if GPU and not {"gpu"} & {*request.fixturenames, *(mark.name for mark in request.node.iter_markers())}:
         monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
 
 

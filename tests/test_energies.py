@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from holosplat.beamline.polychromatic import frames_by_energy
-from holosplat.beamline.simulate import Simulation, simulate
+from holosplat.beamline.simulate import Simulation, frames_by_energy, simulate
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views, rotation_y
 from holosplat.io.nerf_synthetic import read_nerf_synthetic, write_nerf_synthetic

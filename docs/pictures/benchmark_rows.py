@@ -5,8 +5,7 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
-from holosplat_bench.suite.folder import BenchFolder
-from holosplat_bench.suite.rows import Row, read_row
+from holosplat_bench.suite.folder import BenchFolder, Row, read_row
 
 SCORES = ("ssim", "frcm", "psnr", "l1")
 VOLUME = ("dice", "relative_error_delta", "relative_error_beta", "delta_deviation", "ratio", "resolution_half")

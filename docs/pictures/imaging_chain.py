@@ -20,9 +20,8 @@ import numpy as np
 
 import holosplat as hs
 from holosplat.beamline.misalignment import Misalignment
-from holosplat.beamline.polychromatic import polychromatic_frames, refilled
 from holosplat.beamline.record import RecordingOptions, record
-from holosplat.beamline.simulate import Simulation
+from holosplat.beamline.simulate import Simulation, polychromatic_frames, refilled
 from holosplat.io.raw_file import FLAT, PROJECTION
 from holosplat.io.scan_file import open_scan
 from holosplat.optics.camera import Camera

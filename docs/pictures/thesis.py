@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 from matplotlib.figure import Figure
-from tables.thesis import DATA, SCHEDULES, read_rows, studies
+from tables.benchmark import read
+from tables.thesis import SCHEDULES, read_rows, studies
 
 from holosplat.report.style import CYCLE, FAINT, WIDTH, letter, new_figure, styled
-from holosplat_bench.thesis.pages.page import pictures, save
+from holosplat_bench.suite.pages.page import save
+from holosplat_bench.thesis.pages.page import pictures
 
 IMAGES = Path(__file__).resolve().parents[1] / "images"
 CELL_PX = 7.8
@@ -19,8 +20,7 @@ CELL_PX = 7.8
 @styled
 def sampling_figure() -> Figure:
     """Errors of frames over wave samples a pixel, and what views resolve over their number, from sampling.csv."""
-    with (DATA / "sampling.csv").open(newline="") as file:
-        found = list(csv.DictReader(file))
+    found = read("thesis_study/sampling.csv")
     figure = new_figure(0.8 * WIDTH, 2.2)
     left, right = figure.subplots(1, 2)
     for index, (physics, said) in enumerate((("declared", "10 cm"), ("far", "50 cm"))):

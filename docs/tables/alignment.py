@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from .benchmark import markdown, read
+from .benchmark import markdown, read, table
+
+ALIGN = "python benchmarks/alignment.py"
 
 Row = dict[str, str]
 ERRORS = {
@@ -55,6 +57,7 @@ def _change(rows: dict[str, Row], key: str, digits: int, unit: str = "", scale: 
     return f"{before}{unit} → {after}{unit}" if float(before) else "0 (kept)"
 
 
+@table("align-errors", ALIGN, "ten minutes", "alignment.csv")
 def errors() -> str:
     """Errors of what `align` finds of all views, planned → found."""
     lines = list[list[str]]()
@@ -67,6 +70,7 @@ def errors() -> str:
     return markdown(head, lines)
 
 
+@table("align-magnified", ALIGN, "ten minutes", "alignment.csv")
 def magnified() -> str:
     """The same where the magnification is wrong, too."""
     lines = list[list[str]]()
@@ -80,6 +84,7 @@ def magnified() -> str:
     return markdown(("errors of the plan", "magnification", "shifts (px)", "turns across the beam", "roll"), lines)
 
 
+@table("align-volumes", f"{ALIGN} --moments planned aligned refined true", "an hour", "alignment.csv")
 def volumes() -> str:
     """Error of δ and Dice of volumes, by where the frames were taken to be."""
     lines = list[list[str]]()
@@ -96,6 +101,7 @@ def _scores(row: Row) -> str:
     return f"{float(row['error_delta']):.3f}, {float(row['dice']):.3f}"
 
 
+@table("align-series", "python benchmarks/series_alignment.py", "half an hour", "alignment.csv")
 def series() -> str:
     """Series of two and three beams."""
     lines = list[list[str]]()
@@ -106,6 +112,7 @@ def series() -> str:
     return markdown(("series", "shifts (px)", "roll", "time / s"), lines)
 
 
+@table("align-series-volumes", "python benchmarks/series_alignment.py", "an hour", "alignment.csv")
 def series_volumes() -> str:
     """Dice of volumes of three times of a series."""
     draws = {"3 beams": "", "other errors": ", other errors", "third errors": ", third errors"}
@@ -120,6 +127,7 @@ def series_volumes() -> str:
     return markdown(("Dice", "as planned", "`align`", "known geometry"), lines)
 
 
+@table("few-views", "python benchmarks/few_views.py", "ten minutes", "few_views.csv")
 def few_views() -> str:
     """Few views that judge themselves: planned → found ± as said."""
     lines = list[list[str]]()
@@ -133,6 +141,7 @@ def few_views() -> str:
     return markdown(("frames", "shifts (px)", "turns across the beam (°)", "roll (°)", "as planned"), lines)
 
 
+@table("calibration", "python benchmarks/calibration.py", "minutes", "calibration.csv")
 def calibration() -> str:
     """What a known body leaves of the errors of a plan."""
     lines = list[list[str]]()

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import csv
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from decimal import ROUND_HALF_UP, Decimal
 from pathlib import Path
 
 from holosplat_bench.suite.case import case_names
 from holosplat_bench.suite.references import REFERENCES
+
+BENCH = "holosplat bench run --out bench --snapshots DIR --seeds 101 102, then python docs/figures.py benchmark bench"
 
 DATA = Path(__file__).parents[1] / "data"
 Row = dict[str, str]
@@ -48,6 +51,30 @@ PHOTOGRAPHS = ("alpha-3dgs", "nerf")
 SHARP = ("sharp-even", "sharp-light", "sharp-drift")
 
 
+@dataclass(frozen=True)
+class Table:
+    """A table of a page: its text from data files, and the command that makes these, with its length."""
+
+    make: Callable[[], str]
+    data: tuple[str, ...]
+    command: str
+    takes: str
+
+
+TABLES: dict[str, Table] = {}
+"""All tables of the documentation by their names."""
+
+
+def table(name: str, command: str, takes: str, *data: str) -> Callable[[Callable[[], str]], Callable[[], str]]:
+    """Enter the decorated function as the table `name` of the files `data` of docs/data, which `command` makes."""
+
+    def entered(make: Callable[[], str]) -> Callable[[], str]:
+        TABLES[name] = Table(make, data, command, takes)
+        return make
+
+    return entered
+
+
 def read(name: str) -> list[Row]:
     """The rows of docs/data/NAME."""
     with (DATA / name).open(newline="", encoding="utf-8") as file:
@@ -84,6 +111,13 @@ def means(rows: list[Row]) -> Means:
     }
 
 
+@table(
+    "overview",
+    f"{BENCH}; and with --seeds 101 --methods pixelnerf onix learned, to docs/data/families.csv",
+    "a day",
+    "benchmark.csv",
+    "families.csv",
+)
 def overview() -> str:
     """Methods on the cases `OVERVIEW_CASES`."""
     found = means(read("families.csv")) | means(read("benchmark.csv"))
@@ -96,6 +130,7 @@ def overview() -> str:
     return f"*{' / '.join(OVERVIEW_CASES)}*\n\n{table}"
 
 
+@table("standing", BENCH, "a day", "benchmark.csv")
 def standing() -> str:
     """Gaussians and surfaces beside the best other method on every case and score."""
     found = means(read("benchmark.csv"))
@@ -131,6 +166,13 @@ def _compared(case: str, name: str, found: Means, others: dict[str, dict[str, fl
     return f"{' / '.join(cells)} ({best:.3f}{'' if ahead else ', *' + str(method) + '*'})"
 
 
+@table(
+    "before-noise",
+    "git show c7e8d51:docs/data/benchmark.csv, its rows of Gaussians in noise",
+    "a second",
+    "before_noise.csv",
+    "benchmark.csv",
+)
 def before_noise() -> str:
     """Gaussians in noise before the changes made for it, and as they are."""
     then, now = means(read("before_noise.csv")), means(read("benchmark.csv"))
@@ -176,6 +218,7 @@ METHODS += ("gerchberg-saxton-tv", "admm-tv", "holographic-tv", "voxels-waves", 
 METHODS += ("auto",)
 
 
+@table("continuous", f"{BENCH} docs/data/benchmark_continuous.csv", "hours", "benchmark_continuous.csv")
 def continuous() -> str:
     """Continuous matter under real light."""
     return by_method(
@@ -183,12 +226,19 @@ def continuous() -> str:
     )
 
 
+@table("absorbers", f"{BENCH} docs/data/benchmark_continuous.csv", "an hour", "benchmark_continuous.csv")
 def absorbers() -> str:
     """A strong absorber, and contact."""
     several = [m for m in METHODS if m not in ("paganin-tv", "ctf-tv", "gerchberg-saxton-tv", "admm-tv", "gaussians")]
     return by_method(read("benchmark_continuous.csv"), ABSORBERS, ("ssim", "relative_error_beta", "dice"), several)
 
 
+@table(
+    "measured",
+    f"{BENCH} docs/data/benchmark_continuous.csv (with --data FOLDER)",
+    "an hour",
+    "benchmark_continuous.csv",
+)
 def measured() -> str:
     """Measured frames."""
     left_out = ("paganin-tv", "ctf-tv", "gerchberg-saxton-tv", "admm-tv", "gaussians", "neural-field")
@@ -196,12 +246,21 @@ def measured() -> str:
     return by_method(read("benchmark_continuous.csv"), MEASURED, ("ssim", "relative_error_beta"), several)
 
 
+@table("sharp-light", f"{BENCH} docs/data/sharp_light.csv", "an hour", "sharp_light.csv")
 def sharp_light() -> str:
     """Sharp cells in uneven light."""
     several = ("holographic-tv", "gaussians", "surfaces", "auto")
     return by_method(read("sharp_light.csv"), SHARP, ("relative_error_delta", "dice"), several)
 
 
+@table(
+    "photographs",
+    "holosplat bench run --cases cells12 cells4 --methods alpha-3dgs nerf --seeds 101 --snapshots DIR --out bench, "
+    "then python docs/figures.py benchmark-rows bench docs/data/photographs.csv",
+    "ten minutes",
+    "photographs.csv",
+    "benchmark.csv",
+)
 def photographs() -> str:
     """Methods without waves, beside some with them, on one scene a case."""
     rows = [row for row in read("photographs.csv") + read("benchmark.csv") if row["seed"] == "101"]
@@ -209,6 +268,7 @@ def photographs() -> str:
     return by_method(rows, PHOTOGRAPHED, tuple(STANDING), several)
 
 
+@table("misaligned", f"{BENCH} docs/data/benchmark_misaligned.csv", "hours", "benchmark_misaligned.csv")
 def misaligned() -> str:
     """Beams that are not where they say, of each method with 12 and 4 training views."""
     found = means(read("benchmark_misaligned.csv"))
@@ -225,6 +285,7 @@ def misaligned() -> str:
     return markdown(("method, `misaligned12` / `misaligned4`", "SSIM", "FRCM", "Dice", "error of δ"), lines)
 
 
+@table("round-cell", "python benchmarks/round_cell.py", "minutes", "round_cell.csv")
 def round_cell() -> str:
     """A nearly round cell, by views and what is told, of the first seed."""
     rows = [row for row in read("round_cell.csv") if row["seed"] == "1"]

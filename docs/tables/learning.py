@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from .benchmark import Row, markdown, read, rounded
+from .benchmark import Row, markdown, read, rounded, table
 
 STARTS = {"The run began with the": "guess", "The run began with phase": "phase", "The frames contradict": "refused"}
 STARTS |= {"The run began with red cells": "red cells"}
@@ -16,6 +16,7 @@ SCORES = ("dice", "ssim", "frcm")
 """Scores of which more is better."""
 
 
+@table("learned", "python benchmarks/learned.py DATA --write", "half an hour", "learned.csv")
 def learned() -> str:
     """Runs with and without a learned start, and the guess itself, by case, scene and number of views."""
     lines = []
@@ -37,6 +38,7 @@ def learned() -> str:
     return markdown(columns, lines)
 
 
+@table("ellipsoids", "python benchmarks/ellipsoids.py --write", "hours", "ellipsoids.csv")
 def ellipsoids() -> str:
     """PSNR, SSIM of the volume and SSIM of held-out frames, by kind of scene, method and number of views."""
     rows = read("ellipsoids.csv")
@@ -58,6 +60,7 @@ def ellipsoids() -> str:
     return markdown(("scenes", "method", "4 views", "7 views", "9 views"), lines)
 
 
+@table("learned_change", "python benchmarks/learned.py DATA --write", "half an hour", "learned.csv")
 def learned_change() -> str:
     """By what scores of runs with a learned start differ from those without, by case."""
     found: dict[str, list[dict[str, dict[str, str]]]] = {}
@@ -81,6 +84,7 @@ def _learned() -> dict[tuple[str, int, int], dict[str, dict[str, str]]]:
     return {key: rows for key, rows in found.items() if len(rows) == 3}
 
 
+@table("aligned-inference", "python benchmarks/aligned_inference.py --write", "a minute", "aligned_inference.csv")
 def aligned_inference() -> str:
     """Seconds in which a pixel-aligned field says its values, as fits do and without gradients."""
     lines = []
@@ -96,6 +100,7 @@ SEEN = ("nothing", "frames", "frames, adversary 0.1")
 """What weights of `onix` were learnt from, in the order of the table."""
 
 
+@table("onix-scenes", "python benchmarks/onix_scenes.py FOLDER --write", "an hour", "onix_scenes.csv")
 def onix_scenes() -> str:
     """Scores of `onix` on scenes that it has not seen, each scene, by what it learnt from and number of views."""
     rows = read("onix_scenes.csv")
@@ -133,6 +138,16 @@ OF_SUITE = {"dice": "dice", "error": "relative_error_delta", "frcm": "frcm"}
 """Names of these scores in rows of the benchmark."""
 
 
+@table(
+    "few-families",
+    "python benchmarks/few_families.py DATA --write, python benchmarks/learned.py DATA --write",
+    "half an hour",
+    "few_families.csv",
+    "learned.csv",
+    "photographs.csv",
+    "families.csv",
+    "benchmark.csv",
+)
 def few_families() -> str:
     """Families of methods in two, three and four views of one scene, and in four of one of the suite."""
     suite = {
@@ -156,6 +171,14 @@ def _scores(row: Row) -> str:
     return " / ".join(rounded(row[name], 3) for name in SCORED).replace("-0.000", "0.000").replace("-", "−")
 
 
+@table(
+    "moving-families",
+    "python benchmarks/motion.py DATA --write, and pinn.py and moving_matter.py with --write",
+    "hours",
+    "motion.csv",
+    "pinn.csv",
+    "moving_matter.csv",
+)
 def moving_families() -> str:
     """What joins times: Dice and error of δ, means over times and seeds, beside each time by itself."""
     lines = []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .benchmark import Row, markdown, read
+from .benchmark import Row, markdown, read, table
 
 KINDS = ["bubbles", "cuvette", "jet", "break-up", "crack", "shock", "keyhole", "lattice", "fibres", "channel", "star"]
 HEAD = {
@@ -12,7 +12,8 @@ HEAD = {
 }
 
 
-def scenes(size: str) -> str:
+@table("matter", "python benchmarks/matter_scenes.py --seeds 101", "hours", "matter_scenes.csv")
+def scenes(size: str = "small") -> str:
     """Error of δ / Dice / total over the true one, of each kind by each run that there is, of seeds for reporting."""
     rows = [row for row in read("matter_scenes.csv") if row["size"] == size and row["use"] == "reporting"]
     runs, lines = [run for run in HEAD if any(row["run"] == run for row in rows)], []

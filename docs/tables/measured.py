@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from .benchmark import markdown, read, rounded
+from .benchmark import markdown, read, rounded, table
+
+REAL = "python benchmarks/real_data.py --data FOLDER"
 
 Values = dict[tuple[str, str, str], str]
 """(case, method, measure) → value; the last row of a file counts."""
@@ -21,6 +23,7 @@ def three(found: Values, case: str, method: str, measure: str) -> str:
     return rounded(found[case, method, measure], 3)
 
 
+@table("dome", REAL, "half an hour", "real_data.csv")
 def dome() -> str:
     """The dome of the capsule, in light found anew and taken as certain; the best of five in bold."""
     found = values()
@@ -39,6 +42,7 @@ def dome() -> str:
     return markdown((*head, "the same, light taken as certain", "", ""), lines).replace("|  |  |", "| | |", 1)
 
 
+@table("whole", REAL, "half an hour", "real_data.csv")
 def whole() -> str:
     """The whole capsule."""
     found, lines = values(), []
@@ -50,6 +54,7 @@ def whole() -> str:
     return markdown(("method", "held-out SSIM", "correlation, slope of µ", "of the dome alone"), lines)
 
 
+@table("tooth", REAL, "half an hour", "real_data.csv")
 def tooth() -> str:
     """Two rows of a tooth."""
     rows = [r for r in read("real_data.csv") if r["case"] == "tooth"]
@@ -60,6 +65,7 @@ def tooth() -> str:
     return markdown(("method", "held-out SSIM", "correlation with FBP of all", "slope of µ", "time / s"), lines)
 
 
+@table("hair", REAL, "half an hour", "real_data.csv")
 def hair() -> str:
     """One hologram of a spider hair."""
     rows = [r for r in read("real_data.csv") if r["case"] == "spider hair"]
@@ -72,6 +78,7 @@ def hair() -> str:
     return markdown(head, lines)
 
 
+@table("bed", "python benchmarks/packed_bed.py --data FOLDER --work FOLDER", "an hour", "real_data.csv")
 def bed() -> str:
     """A packed bed, of 8, 4 and 2 views."""
     found, lines = values(), []
@@ -89,6 +96,7 @@ def bed() -> str:
     return markdown((head, "8 views", "4 views", "2 views"), lines)
 
 
+@table("compact-series", "python benchmarks/compact_series.py NAME RUNS --write", "minutes", "compact_series.csv")
 def compact_series() -> str:
     """Objects of several times, in files of their own and in one."""
     lines = list[list[str]]()
@@ -98,6 +106,7 @@ def compact_series() -> str:
     return markdown(("objects", "as runs hold them", "compact, each by itself", "in one file"), lines)
 
 
+@table("triangles", "python benchmarks/triangles.py --csv docs/data/triangles.csv", "half an hour", "triangles.csv")
 def triangles() -> str:
     """Surfaces on fine pixels by more and fewer triangles."""
     lines = list[list[str]]()
@@ -109,6 +118,7 @@ def triangles() -> str:
     return markdown((*head, "error of δ", "on the way"), lines)
 
 
+@table("cell", "python benchmarks/measured_cell.py --data FOLDER", "a quarter of an hour", "measured_cell.csv")
 def cell() -> str:
     """The living cell by default."""
     lines = []
@@ -118,3 +128,31 @@ def cell() -> str:
         lines.append([views, distance, photons if photons != "0" else "–", "nothing" if unknown else "δ/β", *errors])
     head = ("views", "λz / pixel²", "photons", "told", "held-out phase", "total phase", "held-out hologram")
     return markdown((*head, "processor / s"), lines)
+
+
+@table("gpu", "python benchmarks/gpu.py --csv docs/data/gpu.csv", "a minute, with a GPU", "gpu.csv")
+def gpu() -> str:
+    """Kernels, and steps of a fit, on a GPU."""
+    lines = list[list[str]]()
+    for row in read("gpu.csv"):
+        rate = f"{float(row['pairs_per_s']) / 1e9:.0f}" if row["pairs_per_s"] else "–"
+        error = f"{float(row['error']):.1e}" if row["error"] else "–"
+        lines.append([row["what"], row["way"], rounded(row["ms"], 2), rate, error])
+    return markdown(("what", "way", "time / ms", "1e9 pairs/s", "error"), lines)
+
+
+@table(
+    "gpu-runs",
+    "python benchmarks/sizes.py --pixels 256 512 --method auto --backend cuda --csv docs/data/gpu_runs.csv, and 256 "
+    "pixels with --backend cpu",
+    "a minute, with a GPU",
+    "gpu_runs.csv",
+)
+def gpu_runs() -> str:
+    """Whole runs by a GPU and by processors of the same machine."""
+    lines = list[list[str]]()
+    for row in read("gpu_runs.csv"):
+        scores = [rounded(row[name], 4) for name in ("ssim", "frcm", "dice", "relative_error_delta")]
+        lines.append([row["pixels"], row["machine"], *scores, row["seconds"], row["cpu_seconds"]])
+    head = ("pixels", "machine", "SSIM", "FRCM", "Dice", "error of δ", "time / s", "of processors / s")
+    return markdown(head, lines)

@@ -5,7 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from decimal import Decimal
 
-from .benchmark import Row, markdown, read, rounded
+from .benchmark import Row, markdown, read, rounded, table
+
+FORECAST = "python benchmarks/forecast.py DATA --write"
+
+TRACKED = "python benchmarks/motion.py DATA --write"
 
 BEAMS = {"flow4": "4 over 180°", "flow3": "3 at 0°, 30°, 48°", "flow2": "2 at 0°, 90°", "flow2n": "2 at 0°, 23.8°"}
 """The cases of benchmarks/motion.py, without what their names say of the bodies, in the order of the table."""
@@ -37,6 +41,7 @@ NONE = dict.fromkeys(("normal_um", "band_um", "ssim"), "")
 # --- bodies that are tracked --------------------------------------------------------------------------------
 
 
+@table("tracked", f"{TRACKED} --cases flow4 flow3 …", "an hour", "motion.csv")
 def tracked() -> str:
     """Beams, and what is known of the bodies, at the first sixteen times."""
     rows = {row["case"]: row for row in read("motion.csv") if (_window(row), row["times"]) == ((0, 1), "16")}
@@ -60,6 +65,7 @@ COLUMNS = (
 )
 
 
+@table("tracked-windows", TRACKED, "half an hour", "motion.csv", "motion_ablation.csv")
 def windows() -> str:
     """Four beams at other times; the last columns are errors over standard errors."""
     rows = [row for row in read("motion.csv") if row["case"] == "flow4"]
@@ -74,6 +80,7 @@ def windows() -> str:
     return _tight(markdown(("snapshots", *COLUMNS, "centres", "volumes"), lines))
 
 
+@table("tracked-others", f"{TRACKED} --cases flow2-body --first 8", "an hour", "motion.csv")
 def others() -> str:
     """Fewer than four beams at other times; the last columns are errors over standard errors."""
     cases = [case + end for end in ("", KNOWN) for case in BEAMS if case != "flow4"]
@@ -88,6 +95,7 @@ def others() -> str:
     return markdown(("beams", "snapshots", *COLUMNS, "centres", "volumes"), lines)
 
 
+@table("tracked-ablation", f"{TRACKED} --ablation", "an hour", "motion_ablation.csv")
 def ablation() -> str:
     """One prior left out at a time."""
     rows = {row["without"]: row for row in read("motion_ablation.csv")}
@@ -128,6 +136,7 @@ def _scores(row: Row, of: bool) -> list[str]:
 # --- forecasts ----------------------------------------------------------------------------------------------
 
 
+@table("forecast", FORECAST, "an hour", "forecast.csv")
 def forecast() -> str:
     """How far surfaces are off ahead, by how paths go on; and SSIM of the frames; of each case that was run."""
     rows = read("forecast.csv")
@@ -150,6 +159,7 @@ SEEN = ("splines", "paths", "auto")
 """Ways whose frames are scored in the table."""
 
 
+@table("forecast-mechanics", FORECAST, "an hour", "forecast.csv")
 def mechanics() -> str:
     """The modulus found, and a wrong one, without a flow beside each cell."""
     found = _by_model(read("forecast.csv"), "flow4")
@@ -197,6 +207,7 @@ FADING = "all times in one, fading"
 WAYS = ("all times in one", "each time by itself", "mean", "one time of all photons")
 
 
+@table("moving-matter", "python benchmarks/moving_matter.py --write", "ten minutes", "moving_matter.csv")
 def moving_matter() -> str:
     """Relative errors of δ, mean (worst time)."""
     rows = {(row["case"], row["method"]): row for row in read("moving_matter.csv")}
@@ -220,6 +231,7 @@ def _error(row: Row | None) -> str:
 # --- cells that flow ----------------------------------------------------------------------------------------
 
 
+@table("espresso", "python benchmarks/espresso_flow.py DATA", "minutes", "espresso_flow.csv")
 def espresso() -> str:
     """Sixteen cells beside ESPResSo's: drift, shape, elongation, volume and area."""
     rows = read("espresso_flow.csv")

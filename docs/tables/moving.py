@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .benchmark import Row, markdown, read, rounded
+from .benchmark import Row, markdown, read, rounded, table
 
 WAYS = {
     "each-tv": "each time by itself, total variation",
@@ -25,6 +25,14 @@ KNOWN = "-body"
 CASES = ("flow4", "flow3", "flow2", "stir4", "burst4")
 
 
+@table(
+    "moving_methods",
+    "python benchmarks/moving_methods.py DATA --cases flow4 flow3 flow2 stir4 burst4 --write",
+    "an hour",
+    "moving_methods.csv",
+    "motion.csv",
+    "moving_matter.csv",
+)
 def moving_methods() -> str:
     """Each way beside ours, whose rows are those of docs/data/motion.csv and docs/data/moving_matter.csv."""
     rows = [r for r in read("moving_methods.csv") if (r["seed"], r["first"]) in (("1", "0"), ("1", "5"))]
@@ -56,6 +64,12 @@ def _ours() -> list[Row]:
     return [*bodies, *matter]
 
 
+@table(
+    "tracked-carrier",
+    "python benchmarks/carrier.py DATA --cases flow4 --write, as of commit 6bfff929",
+    "ten minutes",
+    "carrier.csv",
+)
 def carrier() -> str:
     """Runs with and without a velocity field that bodies share; cells that are seen briefly, of those there are."""
     lines = []
@@ -72,6 +86,7 @@ def carrier() -> str:
     return markdown((*columns, "seen briefly and followed", "their middles in the field", "and beyond"), lines)
 
 
+@table("assimilation", "python benchmarks/assimilation.py --write", "five minutes", "assimilation.csv")
 def assimilation() -> str:
     """4D-Var on manufactured holograms: what each assumption finds, and where its cells then are."""
     lines = []

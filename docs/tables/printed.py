@@ -7,10 +7,9 @@ into another module.
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable
 from functools import partial
 
-from .benchmark import DATA, markdown
+from .benchmark import DATA, TABLES, markdown, table
 
 TUNE = "python benchmarks/tune_tomography.py"
 FIELDS = "python benchmarks/tune_fields.py --options noise_weight"
@@ -50,18 +49,12 @@ PRINTED = {
 """Name → what printed it, and how long that takes."""
 
 
-def file_of(name: str) -> str:
-    """Its data, below docs/data."""
-    return f"printed/{name}.csv"
-
-
 def printed(name: str) -> str:
     """A table as it was printed."""
-    with (DATA / file_of(name)).open(newline="", encoding="utf-8") as file:
+    with (DATA / TABLES[name].data[0]).open(newline="", encoding="utf-8") as file:
         head, *lines = csv.reader(file)
     return markdown(head, lines).replace("|  |", "| |").replace("|  |", "| |")
 
 
-def makers() -> dict[str, Callable[[], str]]:
-    """What makes each of them."""
-    return {name: partial(printed, name) for name in PRINTED}
+for _name, (_command, _takes) in PRINTED.items():
+    table(_name, _command, _takes, f"printed/{_name}.csv")(partial(printed, _name))

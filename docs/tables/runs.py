@@ -9,7 +9,11 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from .benchmark import DATA, Row, markdown, read, rounded
+from .benchmark import DATA, Row, markdown, read, rounded, table
+
+MAIN_JOB = "python benchmarks/main_job.py --seeds 311 312 313 --csv FILE --preset auto, and again with --surfaces alone"
+
+DECIDED = "python benchmarks/families.py --data FOLDER"
 
 BEFORE_TURNS = "755086a0cc"
 """The commit of the rows of few_photons.csv to compare with."""
@@ -23,17 +27,27 @@ def script(name: str) -> ModuleType:
     return importlib.import_module(name)
 
 
+@table(
+    "propagation",
+    "python benchmarks/propagation.py --snapshots DIR --csv docs/data/propagation.csv",
+    "ten minutes",
+    "propagation.csv",
+)
 def propagation() -> str:
     """The benchmark's frames beside other programs."""
     return "\n".join(script("propagation").summary(read("propagation.csv")))
 
 
+@table(
+    "ablation", "python benchmarks/ablation.py --snapshots DIR --csv docs/data/ablation.csv", "hours", "ablation.csv"
+)
 def ablation() -> str:
     """What each ingredient is worth."""
     of = script("ablation")
     return "\n".join(of.summary(of.read(DATA / "ablation.csv")))
 
 
+@table("trials", "python benchmarks/trials.py --csv docs/data/trials.csv", "an hour", "trials.csv")
 def trials() -> str:
     """What was tried and left out: SSIM / FRCM, Dice / error of δ."""
     rows = read("trials.csv")
@@ -50,11 +64,13 @@ def _four(row: Row) -> str:
     return f"{ssim} / {frcm}, {dice} / {error}"
 
 
+@table("neural-options", "python benchmarks/tune_fields.py --csv FILE", "hours", "tune_fields.csv")
 def neural_options() -> str:
     """Options of neural fields."""
     return _fields("neural", "ed18f76")
 
 
+@table("voxel-options", "python benchmarks/tune_fields.py --csv FILE", "an hour", "tune_fields.csv")
 def voxel_options() -> str:
     """Options of voxels."""
     return _fields("voxels", "6e3bb1e")
@@ -68,6 +84,7 @@ def _fields(method: str, commit: str) -> str:
     return "\n".join(script("tune_fields").table(rows, method))
 
 
+@table("verdicts", "python benchmarks/verdicts.py", "ten minutes", "verdicts.csv")
 def verdicts() -> str:
     """Right and wrong runs."""
     lines = []
@@ -78,6 +95,7 @@ def verdicts() -> str:
     return markdown((*head, "over what is allowed", "verdict"), lines)
 
 
+@table("imaging-chain", "python docs/figures.py imaging-chain WORK", "ten minutes", "imaging_chain.csv")
 def imaging_chain() -> str:
     """The cost of each imperfection."""
     names = ("ssim", "frcm", "dice", "relative_error_delta")
@@ -85,6 +103,7 @@ def imaging_chain() -> str:
     return markdown(("imperfection", "SSIM", "FRCM", "Dice", "relative error of δ"), lines)
 
 
+@table("imperfections", "python docs/figures.py simulation", "minutes", "simulation_imperfections.csv")
 def imperfections() -> str:
     """Motion and misalignment: what they do to a reconstruction."""
     names = ("ssim", "dice", "relative_error_delta")
@@ -92,6 +111,7 @@ def imperfections() -> str:
     return markdown(("", "SSIM of held-out views", "Dice", "relative error of δ"), lines).replace("|  |", "| |", 1)
 
 
+@table("fibre", "python benchmarks/fibre.py", "ten minutes", "fibre.csv")
 def fibre() -> str:
     """A fibre in uneven light, by method: one frame, or from the least to the greatest of several seeds."""
     lights = {"even": "even light", "noise": "even light, 1900 photons"}
@@ -109,11 +129,13 @@ def fibre() -> str:
     return markdown(head, lines)
 
 
+@table("skalak", "python benchmarks/tweezers.py", "minutes", "tweezers.csv")
 def skalak() -> str:
     """Optical tweezers, Skalak's law."""
     return _tweezers("Skalak")
 
 
+@table("springs", "python benchmarks/tweezers.py", "minutes", "tweezers.csv")
 def springs() -> str:
     """Optical tweezers, springs of which a part does not soften."""
     return _tweezers("springs")
@@ -150,6 +172,7 @@ def deviation(row: Mapping[str, Any]) -> float:
     return 100 * (float(row["mean_delta"]) / float(row["true_mean_delta"]) - 1)
 
 
+@table("main-job", MAIN_JOB, "five minutes", "main_job_idle.csv")
 def main_job() -> str:
     """24 cells, each seed, each of `WAYS`."""
     named = [row | {"name": f"{row['seed']}, {WAYS[row['preset'], row['method']]}"} for row in jobs()]
@@ -171,11 +194,25 @@ def _jobs(rows: Sequence[Mapping[str, Any]], seconds: str, called: str) -> str:
     return markdown((*head, called), lines)
 
 
+@table(
+    "rerun",
+    "OMP_NUM_THREADS=1 python benchmarks/main_job.py --cases cells nine ratio free noise poses plasma --surfaces --csv "
+    "docs/data/main_job.csv",
+    "an hour",
+    "main_job.csv",
+)
 def rerun() -> str:
     """The generated jobs whose rows stand in main_job.csv."""
     return _rerun(lambda case: case != "snapshot")
 
 
+@table(
+    "snapshot",
+    "OMP_NUM_THREADS=1 python benchmarks/main_job.py --cases snapshot --meshes DIR/rbc*_049.vtk --surfaces --csv "
+    "docs/data/main_job.csv",
+    "two minutes",
+    "main_job.csv",
+)
 def snapshot() -> str:
     """The job of another program's cells."""
     return _rerun(lambda case: case == "snapshot")
@@ -185,6 +222,12 @@ def _rerun(wanted: Callable[[str], bool]) -> str:
     return _jobs([row for row in read("main_job.csv") if wanted(row["case"])], "cpu_seconds", "processor time / s")
 
 
+@table(
+    "sizes",
+    "python benchmarks/sizes.py --pixels 128 256 512 1024 --method auto --csv docs/data/sizes.csv",
+    "minutes",
+    "sizes.csv",
+)
 def sizes() -> str:
     """Frames of more and more pixels across the same field."""
     lines = []
@@ -198,6 +241,7 @@ def sizes() -> str:
     return markdown((*head, "time / s", "of processors / s", "peak / GiB", "load", "commit"), lines)
 
 
+@table("stages", "python benchmarks/stages.py --pixels 128 512 --csv docs/data/stages.csv", "minutes", "stages.csv")
 def stages() -> str:
     """What the stages of a run take, of sizes beside each other."""
     rows = read("stages.csv")
@@ -219,6 +263,7 @@ def worst(way: tuple[str, str]) -> dict[str, str]:
     return found | {"time": f"{max(row['seconds'] for row in rows):.0f} s", "more": f"{more:.0f} s more"}
 
 
+@table("readme", MAIN_JOB, "five minutes", "main_job_idle.csv")
 def readme() -> str:
     """README's."""
     called = {"ssim": "SSIM of held-out views", "frcm": "FRCM of held-out views", "dice": "Dice of the volume"}
@@ -229,6 +274,7 @@ def readme() -> str:
     return table.replace("|  |", "| |", 1)
 
 
+@table("wanted", MAIN_JOB, "five minutes", "main_job_idle.csv")
 def wanted() -> str:
     """The same beside what was wanted."""
     aims = {
@@ -272,6 +318,7 @@ SERIES = {
 """What the table of series shows, by case and measure."""
 
 
+@table("series", "python benchmarks/series.py --csv docs/data/series.csv", "an hour", "series.csv")
 def series() -> str:
     """What tasks, warm starts and kills cost, with the load that the machine had."""
     lines = []
@@ -291,6 +338,12 @@ EQUATIONS = {
 """What the table of pinn calls its fields, in order."""
 
 
+@table(
+    "pinn",
+    "python benchmarks/pinn.py --cases channel swirl --write (and espresso with --data)",
+    "half an hour",
+    "pinn.csv",
+)
 def pinn() -> str:
     """Fields of space and time with and without equations, each seed."""
     rows = read("pinn.csv")
@@ -312,6 +365,7 @@ def pinn() -> str:
     return markdown(columns, lines)
 
 
+@table("random_scenes", "python benchmarks/random_scenes.py --write", "half an hour", "random_scenes.csv")
 def random_scenes() -> str:
     """Error of δ, Dice, total and verdict of the default method, a line a scene."""
     lines = []
@@ -326,24 +380,28 @@ def random_scenes() -> str:
     return markdown(columns, lines)
 
 
+@table("families-rules", DECIDED, "an hour", "decision_families.csv")
 def families_rules() -> str:
     """Families that rules of decision were made on beside all others."""
     of = script("families")
     return markdown(of.RULES, of.table_of_rules(of.rows_of(of.PAGE))).replace("|  |", "| |", 1)
 
 
+@table("families-scenes", DECIDED, "an hour", "decision_families.csv")
 def families_scenes() -> str:
     """Each scene of these families: what was decided, and what that cost."""
     of = script("families")
     return markdown(of.SCENES, of.table_of_scenes(of.rows_of(of.PAGE)))
 
 
+@table("faults", "python benchmarks/faults.py --trials 200 --csv docs/data/faults.csv", "an hour", "faults.csv")
 def faults() -> str:
     """What commands did when they were disturbed, kind by kind."""
     head = ("kind", "trials", "traceback", "hang", "crash", "silent", "torn", "lost", "let in")
     return markdown(head, [[row[name] for name in head] for row in read("faults.csv")])
 
 
+@table("few-photons", "python benchmarks/few_photons.py", "half an hour", "few_photons.csv")
 def few_photons() -> str:
     """Closed bodies in few photons, at the commit before surfaces took turns with the volume, and after."""
     rows, lines = read("few_photons.csv"), list[list[str]]()

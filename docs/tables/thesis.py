@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterable, Sequence
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -14,9 +14,11 @@ from holosplat.report.style import scientific
 from holosplat_bench.thesis.configurations import EVERY, PACES, THESIS_TABLE
 from holosplat_bench.thesis.findings import findings
 from holosplat_bench.thesis.folder import CURVES, Study
-from holosplat_bench.thesis.pages.page import markdown_table
 
+from .benchmark import TABLES, Table, markdown, read
 from .runs import script
+
+THESIS = "python benchmarks/thesis_runs.py run RUNS --snapshots DIR, then collect RUNS"
 
 DATA = Path(__file__).resolve().parents[1] / "data" / "thesis_study"
 SCHEDULES = {"short": "3 000 steps", "third": "10 000 steps", "full": "30 000 steps"}
@@ -28,8 +30,7 @@ Row = dict[str, str]
 
 def read_rows() -> list[Row]:
     """runs.csv, a row a run."""
-    with (DATA / "runs.csv").open(newline="") as file:
-        return list(csv.DictReader(file))
+    return read("thesis_study/runs.csv")
 
 
 def where(row: Row) -> tuple[str, str, str]:
@@ -65,8 +66,7 @@ def look(row: Row, when: str) -> dict[str, float | None]:
 def read_curves(row: Row) -> dict[str, np.ndarray]:
     """The curves of a run."""
     name = "_".join((*where(row), row["seed"], row["name"]))
-    with (DATA / f"{name}.csv").open(newline="") as file:
-        table = list(csv.DictReader(file))
+    table = read(f"thesis_study/{name}.csv")
     return {key: np.array([float(line[key]) for line in table]) for key in CURVES}
 
 
@@ -118,12 +118,12 @@ def line(name: str, rows: Sequence[Row]) -> tuple[str, ...]:
     )
 
 
-def table(rows: Sequence[Row]) -> list[str]:
+def table(rows: Sequence[Row]) -> str:
     """A table with a line for each configuration, seeds taken together."""
     order = [c.name for c in EVERY]
     ordered = sorted(rows, key=lambda row: (order.index(row["name"]), row["case"], row["physics"], int(row["seed"])))
     groups = [(key, list(group)) for key, group in groupby(ordered, key=lambda row: row["name"])]
-    return markdown_table(HEAD, [line(key, group) for key, group in groups])
+    return markdown(HEAD, [line(key, group) for key, group in groups])
 
 
 def verdicts() -> str:
@@ -132,12 +132,12 @@ def verdicts() -> str:
     lines = [(f.claim, name, f.verdict, f.evidence) for name, each in found.items() for f in each]
     order = [f.claim for f in next(iter(found.values()))]
     ordered = sorted(lines, key=lambda made: order.index(made[0]))
-    return "\n".join(markdown_table(("finding", "schedule, seed", "verdict", "evidence"), ordered))
+    return markdown(("finding", "schedule, seed", "verdict", "evidence"), ordered)
 
 
 def configurations(schedule: str) -> str:
     """The configurations under one schedule, on the case as declared."""
-    return "\n".join(table([row for row in read_rows() if where(row) == (schedule, *PLAIN)]))
+    return table([row for row in read_rows() if where(row) == (schedule, *PLAIN)])
 
 
 def others(schedule: str) -> str:
@@ -146,7 +146,7 @@ def others(schedule: str) -> str:
     lines = []
     for (case, physics), _ in groupby(sorted(main, key=_setting), key=_setting):
         lines += [line(f"{case}, {physics}", [row for row in main if _setting(row) == (case, physics)])]
-    return "\n".join(markdown_table(("case, physics", *HEAD[1:]), lines))
+    return markdown(("case, physics", *HEAD[1:]), lines)
 
 
 def _setting(row: Row) -> tuple[str, str]:
@@ -177,4 +177,17 @@ def left() -> str:
         at = first.index(tasks[0].name)
         command = " ".join([*first[:at], *(task.name for task in tasks), *first[at + 1 :]])
         lines.append((SCHEDULES[tasks[0].schedule], str(len(tasks)), f"`{command}`"))
-    return "\n".join(markdown_table((f"{len(missing)} runs are left: steps", "runs", "command"), lines))
+    return markdown((f"{len(missing)} runs are left: steps", "runs", "command"), lines)
+
+
+TABLES |= {
+    f"thesis-{name}": Table(make, ("thesis_study/runs.csv",), THESIS, "a day")
+    for name, make in (
+        *((schedule, partial(configurations, schedule)) for schedule in SCHEDULES),
+        ("others", partial(others, "short")),
+        ("others-third", partial(others, "third")),
+        ("others-full", partial(others, "full")),
+        ("findings", verdicts),
+        ("left", left),
+    )
+}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,8 @@ BLOCK_BYTES = 2**26
 """Frames read at once where all pass by in turn: 64 MB."""
 
 Index = int | slice | np.ndarray | list[int]
+Taken = tuple[np.ndarray, np.ndarray | None]
+"""Frames [K, H, W], and which of their pixels have no value of their own, [K, H, W] bool; None: all have one."""
 
 
 class Frames(ABC):
@@ -31,6 +33,11 @@ class Frames(ABC):
         """The frames `numbers` [K], of 0 … N - 1 in any order, as float32 [K, H, W], all finite."""
         ...
 
+    def with_missing(self, numbers: np.ndarray) -> Taken:
+        """The frames `numbers`, and the pixels [K, H, W] bool that have no value of their own; None where all have
+        one."""
+        return self.read(numbers), None
+
     def __len__(self) -> int:
         return self.shape[0]
 
@@ -42,7 +49,15 @@ class Frames(ABC):
         return self.read(np.arange(len(self))).astype(dtype or self.dtype, copy=False)
 
 
-class Picked(Frames):
+class Derived(Frames):
+    """Frames made from others, with the pixels that have no value."""
+
+    def read(self, numbers: np.ndarray) -> np.ndarray:
+        """See `Frames.read`."""
+        return self.with_missing(numbers)[0]
+
+
+class Picked(Derived):
     """The frames `index` of others."""
 
     def __init__(self, frames: Frames, index: Index) -> None:
@@ -50,52 +65,68 @@ class Picked(Frames):
         self._numbers = np.arange(len(frames))[index].reshape(-1)
         self.shape = (len(self._numbers), *frames.shape[1:])
 
-    def read(self, numbers: np.ndarray) -> np.ndarray:
-        """See `Frames.read`."""
-        return self._frames.read(self._numbers[numbers])
+    def with_missing(self, numbers: np.ndarray) -> Taken:
+        """See `Frames.with_missing`."""
+        return self._frames.with_missing(self._numbers[numbers])
 
 
-class Cropped(Frames):
+class Cropped(Derived):
     """The rows and columns `rows`, `columns` (from start to stop) of other frames."""
 
     def __init__(self, frames: Frames, rows: slice, columns: slice) -> None:
         self._frames, self._rows, self._columns = frames, rows, columns
         self.shape = (len(frames), rows.stop - rows.start, columns.stop - columns.start)
 
-    def read(self, numbers: np.ndarray) -> np.ndarray:
-        """See `Frames.read`."""
-        found = np.empty((len(numbers), *self.shape[1:]), dtype=np.float32)
-        for i, n in enumerate(numbers):  # one by one: the whole frames may be larger than memory
-            found[i] = self._frames.read(np.array([n]))[0, self._rows, self._columns]
-        return found
+    def with_missing(self, numbers: np.ndarray) -> Taken:
+        """See `Frames.with_missing`."""
+
+        def kept(frames: np.ndarray, missing: np.ndarray | None) -> Taken:
+            place = (slice(None), self._rows, self._columns)
+            return frames[place], None if missing is None else missing[place]
+
+        return by_blocks(self._frames, kept, numbers, self.shape[1:])
 
 
-class Binned(Frames):
+class Binned(Derived):
     """Other frames on pixels `factor` times larger."""
 
     def __init__(self, frames: Frames, factor: int) -> None:
         self._frames, self._factor = frames, factor
         self.shape = (len(frames), frames.shape[1] // factor, frames.shape[2] // factor)
 
-    def read(self, numbers: np.ndarray) -> np.ndarray:
-        """See `Frames.read`."""
-        found = np.empty((len(numbers), *self.shape[1:]), dtype=np.float32)
-        for i, n in enumerate(numbers):  # one by one: the fine frames may be larger than memory
-            found[i] = binned(self._frames.read(np.array([n])), self._factor)[0]
-        return found
+    def with_missing(self, numbers: np.ndarray) -> Taken:
+        """See `Frames.with_missing`."""
+        factor = self._factor
+        return by_blocks(
+            self._frames, lambda frames, missing: binned_measured(frames, missing, factor), numbers, self.shape[1:]
+        )
 
 
-class Divided(Frames):
+class Divided(Derived):
     """Other frames over `light`, [1, H, W] for all or [N, H or 1, W] for each."""
 
     def __init__(self, frames: Frames, light: np.ndarray) -> None:
         self._frames, self._light = frames, light
         self.shape = frames.shape
 
-    def read(self, numbers: np.ndarray) -> np.ndarray:
-        """See `Frames.read`."""
+    def with_missing(self, numbers: np.ndarray) -> Taken:
+        """See `Frames.with_missing`."""
         light = self._light if len(self._light) == 1 else self._light[numbers]
-        return self._frames.read(numbers) / light
+        frames, missing = self._frames.with_missing(numbers)
+        return frames / light, missing
+
+
+def by_blocks(
+    source: Frames, made: Callable[[np.ndarray, np.ndarray | None], Taken], numbers: np.ndarray, shape: tuple[int, int]
+) -> Taken:
+    """What `made` makes of some frames of `source` and their missing pixels at a time, [K, H, W], for all `numbers`."""
+    frames, missing = np.empty((len(numbers), *shape), dtype=np.float32), None
+    for part in parts_of(source, len(numbers)):
+        frames[part], lacks = made(*source.with_missing(numbers[part]))
+        if lacks is not None:
+            missing = np.zeros(frames.shape, dtype=bool) if missing is None else missing
+            missing[part] = lacks
+    return frames, missing
 
 
 def divided(frames: np.ndarray | Frames, light: np.ndarray) -> np.ndarray | Frames:
@@ -120,8 +151,17 @@ def binned(frames: np.ndarray, factor: int) -> np.ndarray:
     return cut.reshape(len(frames), h, factor, w, factor).mean((2, 4))
 
 
-def blocks(frames: np.ndarray | Frames) -> Iterator[np.ndarray]:
-    """All frames in turn, as arrays [K, H, W] of at most about `BLOCK_BYTES`, at least one frame each."""
+def binned_measured(frames: np.ndarray, missing: np.ndarray | None, factor: int) -> Taken:
+    """As `binned`, the means of those pixels alone that have a value; a pixel made of none has none."""
+    if missing is None:
+        return binned(frames, factor), None
+    known = binned((~missing).astype(np.float32), factor)
+    sums, none = binned(np.where(missing, 0, frames), factor), known == 0
+    return np.where(none, binned(frames, factor), sums / np.where(none, 1, known)), none if none.any() else None
+
+
+def parts_of(frames: np.ndarray | Frames, count: int) -> Iterator[slice]:
+    """Slices of `count` numbers, each of so many frames as have about `BLOCK_BYTES`, at least one."""
     at_once = max(1, BLOCK_BYTES // max(1, 4 * frames.shape[1] * frames.shape[2]))
-    for start in range(0, len(frames), at_once):
-        yield frames[start : start + at_once]
+    for start in range(0, count, at_once):
+        yield slice(start, min(start + at_once, count))

@@ -11,8 +11,11 @@ import numpy as np
 from .checks import finite, in_range, require, shaped
 from .display import of_scan
 from .divided_light import DividedLight
-from .frames import Binned, Cropped, Frames, binned, blocks, picked
+from .frames import Binned, Cropped, Frames, Taken, binned_measured, divided, parts_of, picked
 from .geometry import Views
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 ENERGY_RANGE_KEV = (0.1, 1000.0)
 PIXEL_RANGE_M = (1e-10, 1e-2)
@@ -164,11 +167,23 @@ class _FramesInMemory:
         if scan is None:
             raise AttributeError("frames has no default")  # which a dataclass asks the class for
         if isinstance(scan.source, Frames):
-            object.__setattr__(scan, "source", np.asarray(scan.source))
+            frames, missing = scan.source.with_missing(np.arange(len(scan.source)))
+            object.__setattr__(scan, "source", frames)
+            object.__setattr__(scan, "_missing", missing)
         return np.asarray(scan.source)
 
     def __set__(self, scan: Scan, frames: np.ndarray | Frames) -> None:
         object.__setattr__(scan, "source", frames)
+
+
+class _MissingInMemory:
+    """The attribute `Scan.missing`, which is known once the frames are read."""
+
+    def __get__(self, scan: Scan | None, owner: type[Scan] | None = None) -> np.ndarray | None:
+        return None if scan is None or scan.frames is None else scan._missing
+
+    def __set__(self, scan: Scan, missing: np.ndarray | None) -> None:
+        object.__setattr__(scan, "_missing", missing)
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -181,6 +196,8 @@ class Scan:
     is_test: [N] bool, frames held out of the fit.
     provenance: origin of the scan, as flat text entries.
     light: the uncertainty of smooth light that the frames were divided by; None: unknown.
+    missing: [N, H, W] bool, pixels without a value of their own, which `frames` fills from their neighbours, and which
+        have no weight in a reconstruction; None: there are none. Frames that are given as `Frames` say it themselves.
 
     Errors: `InputError` where shapes disagree, and for frames that are not finite.
 
@@ -208,7 +225,12 @@ class Scan:
     is_test: np.ndarray
     provenance: dict[str, str] = field(default_factory=dict)
     light: DividedLight | None = None
+    if TYPE_CHECKING:
+        missing: np.ndarray | None = None
+    else:
+        missing: np.ndarray | None = _MissingInMemory()
     source: np.ndarray | Frames = field(init=False)
+    _missing: np.ndarray | None = field(init=False)
 
     def __post_init__(self) -> None:
         wanted = (len(self.exposures), *self.exposures.views.shape)
@@ -217,6 +239,8 @@ class Scan:
         else:
             frames = shaped("frames", np.ascontiguousarray(self.source, dtype=np.float32), wanted)
             object.__setattr__(self, "source", finite("frames", frames))
+            if self._missing is not None:
+                self.__dict__["_missing"] = shaped("missing", np.asarray(self._missing, dtype=bool), wanted)
         fits = self.light is None or len(self.light) == len(self.exposures)
         require(fits, f"a scan of {wanted[0]} frames needs light of as many, but has {len(self.light or ())}.")
         is_test = shaped("split", np.asarray(self.is_test, dtype=bool), wanted[:1])
@@ -230,14 +254,15 @@ class Scan:
         is_test: np.ndarray,
         provenance: dict[str, str],
         light: DividedLight | None = None,
+        missing: np.ndarray | None = None,
     ) -> Scan:
         """A scan of frames [N, H, W], an array or such as are read when they are asked for."""
         # `_FramesInMemory` takes both
-        return cls(frames, exposures, is_test, provenance, light)  # type: ignore[arg-type]
+        return cls(frames, exposures, is_test, provenance, light, missing)  # type: ignore[arg-type]
 
     def taken(self, exposures: Exposures) -> Scan:
         """The same frames with other exposures."""
-        return Scan.of(self.source, exposures, self.is_test, self.provenance, self.light)
+        return Scan.of(self.source, exposures, self.is_test, self.provenance, self.light, self._missing)
 
     def __len__(self) -> int:
         return len(self.source)
@@ -251,15 +276,38 @@ class Scan:
     def __getitem__(self, index: np.ndarray | list[int] | slice) -> Scan:
         frames = picked(self.source, index)
         light = None if self.light is None else self.light[index]
-        return Scan.of(frames, self.exposures[index], self.is_test[index], self.provenance, light)
+        missing = None if self._missing is None else self._missing[index]
+        return Scan.of(frames, self.exposures[index], self.is_test[index], self.provenance, light, missing)
 
     def in_memory(self) -> Scan:
         """This scan with all its frames read, where bad ones are named: for who uses each of them, more than once."""
-        return Scan.of(self.frames, self.exposures, self.is_test, self.provenance, self.light)
+        return Scan.of(self.frames, self.exposures, self.is_test, self.provenance, self.light, self.missing)
 
     def blocks(self) -> Iterator[np.ndarray]:
         """All frames in turn, some at once, [K, H, W] float32: a few of a long series are in memory at a time."""
-        return blocks(self.source)
+        return (frames for frames, _ in self.blocks_with_missing())
+
+    def blocks_with_missing(self) -> Iterator[Taken]:
+        """The same with the pixels [K, H, W] bool that are `missing`."""
+        for part in parts_of(self.source, len(self)):
+            if isinstance(self.source, Frames):
+                yield self.source.with_missing(np.arange(len(self))[part])
+            else:
+                yield self.source[part], None if self._missing is None else self._missing[part]
+
+    @property
+    def gaps(self) -> Tensor | None:
+        """The `missing` pixels as a tensor, for those who retrieve and fit."""
+        import torch  # which a scan is read without
+
+        return None if self.missing is None else torch.from_numpy(self.missing)
+
+    def left(self, predicted: Tensor) -> Tensor:
+        """The frames [N, H, W] less those predicted, 0 in missing pixels."""
+        import torch
+
+        left = torch.from_numpy(self.frames) - predicted
+        return left if self.gaps is None else left.masked_fill(self.gaps, 0.0)
 
     @property
     def views(self) -> Views:
@@ -296,9 +344,14 @@ class Scan:
         """The same frames as if taken at other poses."""
         return self.taken(replace(self.exposures, views=views))
 
+    def divided(self, light: np.ndarray, said: dict[str, str]) -> Scan:
+        """The scan over `light`, [1, H, W] for all frames or [N, H or 1, W] for each, with `said` of it."""
+        frames = divided(self.source, light)
+        return Scan.of(frames, self.exposures, self.is_test, self.provenance | said, self.light, self._missing)
+
     def with_split(self, is_test: np.ndarray) -> Scan:
         """The scan with the frames `is_test` [N] bool held out, and no others."""
-        return Scan.of(self.source, self.exposures, is_test, self.provenance, self.light)
+        return Scan.of(self.source, self.exposures, is_test, self.provenance, self.light, self._missing)
 
     def cropped(self, rows: slice, columns: slice) -> Scan:
         """The scan on the rows and columns from `start` to `stop` (pixels); the detector's shifts say where it lies.
@@ -312,7 +365,8 @@ class Scan:
         frames = Cropped(whole, rows, columns) if isinstance(whole, Frames) else whole[:, rows, columns]
         exposures = replace(self.exposures, views=self.views.cropped(rows, columns))
         light = self.light and self.light.cropped(rows.start, columns.start)
-        return Scan.of(frames, exposures, self.is_test, self.provenance, light)
+        missing = None if self._missing is None else self._missing[:, rows, columns]
+        return Scan.of(frames, exposures, self.is_test, self.provenance, light, missing)
 
     def coarsened(self, factor: int) -> Scan:
         """The scan on pixels `factor` times larger, or as large as its rows and columns allow."""
@@ -326,7 +380,10 @@ class Scan:
         """The scan on pixels `factor` times larger (means of `factor × factor`); odd rows and columns are cut."""
         if factor == 1:
             return self
-        frames = Binned(self.source, factor) if isinstance(self.source, Frames) else binned(self.source, factor)
+        if isinstance(self.source, Frames):
+            frames, missing = Binned(self.source, factor), None
+        else:
+            frames, missing = binned_measured(self.source, self._missing, factor)
         (h, w), (top, left) = frames.shape[1:], ((n % factor) // 2 for n in self.views.shape)
         odd = np.array([self.views.shape[1] - w * factor - 2 * left, self.views.shape[0] - h * factor - 2 * top])
         views = replace(
@@ -337,7 +394,7 @@ class Scan:
         )
         exposures = replace(self.exposures, views=views, psf_sigma_px=self.exposures.psf_sigma_px / factor)
         light = self.light and self.light.cropped(top, left).binned(factor)
-        return Scan.of(frames, exposures, self.is_test, self.provenance, light)
+        return Scan.of(frames, exposures, self.is_test, self.provenance, light, missing)
 
     def train(self) -> Scan:
         """The training frames only; `InputError` when there are none."""

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import holosplat as hs
 from helpers.polycube import polycube
-from holosplat.align import CalibrationOptions, Uncertain, calibrate
+from holosplat.align import CalibrationOptions, PosePrior, calibrate
 from holosplat.align.calibration import Calibrated, _Search
 from holosplat.align.changes import changes
 from holosplat.align.gauge import moved_onto
@@ -104,7 +104,7 @@ def test_one_bead_tells_no_turns_and_a_pixel_may_be_told():
     """What is not told stays as planned, and is said. The pixel is said to be 3 % larger than it is."""
     said = planned(1.03 * PIXEL)
     scan = frames_of(beads(BEADS[:1], 6.0), planned(), said)
-    options = CalibrationOptions(Uncertain(5.0, 1.0, 1.0, 0.05), pixel=0.05, retrieval=0)
+    options = CalibrationOptions(PosePrior(5.0, 1.0, 1.0, 0.05), pixel=0.05, retrieval=0)
     found = calibrate(scan, KNOWN, 6.0 * PIXEL, options)
     assert "one bead looks the same" in found.words[0]
     np.testing.assert_allclose(found.exposures.views.rotations, said.views.rotations, atol=1e-9)

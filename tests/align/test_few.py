@@ -10,10 +10,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from helpers.misaligned_balls import MATERIAL, scan_of
-from holosplat.align import PoseOptions, Uncertain, align_views
+from holosplat.align import PoseOptions, PosePrior, align_views
 from holosplat.align.derivatives import projections
-from holosplat.align.following import SHARP, SOFT, Following, of_poses
-from holosplat.align.marginal_likelihood import weighed
+from holosplat.align.marginal_likelihood import SHARP, SOFT, Following, of_poses, weighed
 from holosplat.align.null_space import beside, motions
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.geometry import Grid, Views
@@ -101,7 +100,7 @@ def test_few_noisy_frames_leave_a_good_plan():
     scan, _ = scan_of(Misalignment(), 4, 9)
     noise = 0.1 * scan.frames.std() * np.random.default_rng(0).normal(size=scan.frames.shape)
     noisy = replace(scan, frames=(scan.frames + noise).astype(np.float32))
-    options = PoseOptions(Uncertain(shift=1.0, angle=0.5, roll=0.5), rounds=2, retrieval=15, first=10, steps=4, edges=0)
+    options = PoseOptions(PosePrior(shift=1.0, angle=0.5, roll=0.5), rounds=2, retrieval=15, first=10, steps=4, edges=0)
     found = align_views(noisy, MaterialPrior.known(MATERIAL), options)
     assert not found.changes.any()
     (decision,) = (one for one in found.decisions if one.name == "errors of the plan")

@@ -10,7 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from helpers.misaligned_balls import BALLS, MATERIAL, PIXEL, SHAPE, scan_of
-from holosplat.align import PoseOptions, Uncertain
+from holosplat.align import PoseOptions, PosePrior
 from holosplat.align.geometry import Geometry, wanted
 from holosplat.align.held_out import place_frames
 from holosplat.align.views import AlignedViews
@@ -38,7 +38,7 @@ def balls() -> VoxelGrid:
 def test_frames_are_found_beside_matter_that_is_known(error, rounds):
     """One by one, and with no motion of the object to be chosen."""
     scan, true = scan_of(Misalignment(error, 0.6, 0.0, seed=3), 3, 3)
-    options = PoseOptions(Uncertain(shift=2 * error), rounds=rounds, retrieval=15)
+    options = PoseOptions(PosePrior(shift=2 * error), rounds=rounds, retrieval=15)
     found = place_frames(balls(), scan, options)
     turns = np.einsum("vij,vkj->vik", found.exposures.views.rotations, true.views.rotations)
     degrees = np.abs(Rotation.from_matrix(turns).as_rotvec(degrees=True))
@@ -52,7 +52,7 @@ def test_frames_are_found_beside_matter_that_is_known(error, rounds):
 
 def test_frames_that_are_where_they_should_be_stay_near():
     scan, true = scan_of(Misalignment(), 2, 2)
-    found = place_frames(balls(), scan, PoseOptions(Uncertain(angle=0.0, roll=0.0), rounds=2))
+    found = place_frames(balls(), scan, PoseOptions(PosePrior(angle=0.0, roll=0.0), rounds=2))
     assert np.abs(found.changes[:, :2]).max() < 0.05
     np.testing.assert_array_equal(found.exposures.views.rotations, true.views.rotations)
 
@@ -62,7 +62,7 @@ def test_a_geometry_goes_into_files_and_onto_scans():
     train = np.flatnonzero(~scan.is_test)
     there = (np.full((2, 7), 0.5), np.full((2, 7), 0.1), np.zeros(2), np.full(2, 0.2), np.full(2, 0.1), ("kept",))
     found = AlignedViews(true[train], *there)
-    geometry = Geometry.of_training(scan, found, Uncertain(angle=0.0))
+    geometry = Geometry.of_training(scan, found, PosePrior(angle=0.0))
     again = Geometry.from_dict(json.loads(json.dumps(geometry.as_dict())))
     assert again.refined == ("shifts", "roll")
     placed = again.applied(scan)
@@ -80,8 +80,8 @@ def test_a_geometry_goes_into_files_and_onto_scans():
 
 
 def test_what_is_refined_is_named():
-    assert wanted("shifts, roll", Uncertain()) == Uncertain(angle=0.0, distance=0.0)
+    assert wanted("shifts, roll", PosePrior()) == PosePrior(angle=0.0, distance=0.0)
     with pytest.raises(InputError, match="tilt"):
-        wanted("shifts,tilt", Uncertain())
+        wanted("shifts,tilt", PosePrior())
     with pytest.raises(InputError, match="distance"):
-        wanted("distance", Uncertain())
+        wanted("distance", PosePrior())

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from helpers.misaligned_balls import BALLS, MATERIAL, PIXEL, SHAPE, scan_of
-from holosplat.align import AlignedViews, PoseOptions, Uncertain, align_views
+from holosplat.align import AlignedViews, PoseOptions, PosePrior, align_views
 from holosplat.align.derivatives import NUMBERS, in_pixels, predicted
 from holosplat.align.newton import blurred
 from holosplat.align.poses import PoseSearch
@@ -37,7 +37,7 @@ def test_frames_change_as_their_derivatives_say():
     shifts = PIXEL * np.array([[1.2, -0.7], [-0.4, 0.9]])
     views = Views.of_pixels(rotation_tilted([20, 75], [5, -8]), shifts, SHAPE, sizes)
     exposures = Exposures(views, np.array([20.0, 17.0]), np.array([0.1, 0.15]), np.full(2, 0.3), np.zeros(2), 20.0)
-    uncertain = Uncertain(distance=0.02, magnification=0.01)
+    uncertain = PosePrior(distance=0.02, magnification=0.01)
     scan = Scan(np.ones((2, *SHAPE), dtype=np.float32), exposures, np.zeros(2, dtype=bool))
     search = PoseSearch(scan, MATERIAL, PoseOptions(uncertain), None)
     grid = Grid.of_views(in_pixels(views))
@@ -61,7 +61,7 @@ def test_frames_change_as_their_derivatives_say():
 @pytest.fixture(scope="module")
 def magnified() -> tuple[Scan, Exposures, AlignedViews]:
     scan, true = scan_of(Misalignment(0.5, 0.3, 0.0, 2, magnification=0.01), 6)
-    options = PoseOptions(Uncertain(magnification=0.01), rounds=3, retrieval=10, first=20, edges=0)
+    options = PoseOptions(PosePrior(magnification=0.01), rounds=3, retrieval=10, first=20, edges=0)
     return scan, true, align_views(scan, MaterialPrior.known(MATERIAL), options)
 
 
@@ -87,7 +87,7 @@ def test_the_mean_magnification_is_as_planned(magnified):
 
 def test_magnification_is_as_planned_unless_it_is_uncertain():
     scan, _ = scan_of(Misalignment(0.5, 0.0, 0.0, 2, magnification=0.01), 4)
-    options = PoseOptions(Uncertain(1.0, 0.0, 0.0), rounds=1, retrieval=5, first=5, edges=0)
+    options = PoseOptions(PosePrior(1.0, 0.0, 0.0), rounds=1, retrieval=5, first=5, edges=0)
     found = align_views(scan, MaterialPrior.known(MATERIAL), options)
     np.testing.assert_array_equal(found.exposures.views.pixel_sizes, scan.views.pixel_sizes)
     assert not found.changes[:, 6].any()

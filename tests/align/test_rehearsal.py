@@ -12,15 +12,15 @@ from helpers.misaligned_balls import MATERIAL, SHAPE, scan_of
 from holosplat.align.fixed_matter import Beside
 from holosplat.align.marginal_likelihood import _larger
 from holosplat.align.null_space import beside, motions
-from holosplat.align.poses import PoseOptions, PoseSearch, Uncertain
-from holosplat.align.rehearsal import Searched, rehearsed, with_random_phases
+from holosplat.align.poses import PoseOptions, PosePrior, PoseSearch
+from holosplat.align.views import Searched, rehearsed, with_random_phases
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.geometry import Grid
 from holosplat.matter import Matter
 from holosplat.methods.surface_fit import oversampling
 from holosplat.representations import SurfaceMesh, isosurface
 
-FEW = PoseOptions(Uncertain(shift=1.0, angle=0.5, roll=0.5), rounds=1, retrieval=10, first=8, steps=3, edges=0)
+FEW = PoseOptions(PosePrior(shift=1.0, angle=0.5, roll=0.5), rounds=1, retrieval=10, first=8, steps=3, edges=0)
 
 
 def test_random_phases_keep_the_power_and_nothing_else():

@@ -11,7 +11,7 @@ from helpers.row_images import gaussians, placed
 from holosplat.align.derivatives import in_pixels
 from holosplat.align.initial_geometry import ANGLE, Images, geometry_from_rows
 from holosplat.align.null_space import FACTOR as NUMBERS
-from holosplat.align.null_space import Told
+from holosplat.align.null_space import RowInformation
 from holosplat.align.row_sums import COUNT, FACTOR, RETRIEVED, RowPrior, by_rows, plane_angles
 from holosplat.geometry import Views
 
@@ -97,7 +97,7 @@ def information(of_height: float, of_both: float, of_factor: float) -> np.ndarra
 
 def test_errors_are_those_of_the_difference_with_factors_unknown():
     """Of heights of two views only the difference is told: `1 + a - b² / (c + 1/σ²)` of it, by hand."""
-    told = Told.of(information(50.0, 100.0, 300.0), in_pixels(beams(TWO).views), HEIGHTS)
+    told = RowInformation.of(information(50.0, 100.0, 300.0), in_pixels(beams(TWO).views), HEIGHTS)
     ratio = 50.0 - 100.0**2 / (300.0 + RETRIEVED**-2)
     np.testing.assert_allclose(told.ratios, [ratio])
     np.testing.assert_allclose(told.errors[:, 1], np.sqrt(0.5 / (1 + ratio)))
@@ -106,7 +106,7 @@ def test_errors_are_those_of_the_difference_with_factors_unknown():
 
 
 def test_what_is_not_told_is_named_with_its_parts():
-    (said,) = Told.of(information(0.5, 0.0, 1.0), in_pixels(beams(TWO).views), HEIGHTS).words(25.0)
+    (said,) = RowInformation.of(information(0.5, 0.0, 1.0), in_pixels(beams(TWO).views), HEIGHTS).words(25.0)
     assert said.startswith("rows say less than is known of this combination")
     assert "shift y of view 0" in said
     assert "shift y of view 1" in said
@@ -117,8 +117,8 @@ def test_what_is_not_told_is_named_with_its_parts():
 def test_a_motion_that_moves_what_is_known_is_none():
     """Turns x of two views are known: of turns of the whole object only that about y is left."""
     expected = np.array([0.0, 0.0, 0.0, 1.0, 1.0])
-    told = Told.of(np.zeros((2 * COUNT, 2 * COUNT)), in_pixels(beams(TWO).views), expected)
+    told = RowInformation.of(np.zeros((2 * COUNT, 2 * COUNT)), in_pixels(beams(TWO).views), expected)
     assert len(told.ratios) == 2 * 2 - 1
-    free = Told.of(np.zeros((2 * COUNT, 2 * COUNT)), in_pixels(beams(TWO).views), expected + [0, 0, 1, 0, 0])
+    free = RowInformation.of(np.zeros((2 * COUNT, 2 * COUNT)), in_pixels(beams(TWO).views), expected + [0, 0, 1, 0, 0])
     assert len(free.ratios) == 2 * 3 - 3
     assert told.combinations.shape == (3, 2, NUMBERS)

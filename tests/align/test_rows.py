@@ -14,7 +14,7 @@ from helpers.row_images import gaussians, placed
 from holosplat.align.derivatives import in_pixels
 from holosplat.align.gauge import moved_onto
 from holosplat.align.initial_geometry import NONE, REVERSED, Images, geometry_from_rows
-from holosplat.align.null_space import Told, motions
+from holosplat.align.null_space import RowInformation, motions
 from holosplat.align.row_sums import COUNT, RowPrior, Rows, by_rows, conditions, plane_angles
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.geometry import Views, rotation_tilted
@@ -86,11 +86,11 @@ def test_an_object_that_is_stretched_gives_two_beams_the_same_frames():
         assert np.allclose(others @ stretch @ shape @ stretch.T @ others.T, axes @ shape @ axes.T) == same
 
 
-def told_of(angles: tuple[float, ...], times: slice, balls: int = 8) -> Told:
+def told_of(angles: tuple[float, ...], times: slice, balls: int = 8) -> RowInformation:
     values, planned, _ = images(angles, Misalignment(), balls)
     values = values + 0.02 * np.random.default_rng(0).normal(size=values.shape)
     found = by_rows(values[times], planned, RowPrior.of(EXPECTED * [1, 1, 1, 0, 1], len(angles)), WHEN[times])
-    return Told.of(found.information, planned, EXPECTED)
+    return RowInformation.of(found.information, planned, EXPECTED)
 
 
 def test_two_beams_never_tell_the_angle_between_them():
@@ -169,7 +169,7 @@ def test_angles_between_beams_are_free_where_they_are_told_firmly(share, free):
     """What is told of them grows with the square of what is uncertain; 25 times that is a fifth of the error."""
     values, planned, _ = images(THREE, Misalignment(1.0, 0.6, 0.0, seed=2))
     held = by_rows(values, planned, RowPrior.of(EXPECTED * [1, 1, 1, 0, 1], 3), WHEN)
-    least = Told.of(held.information, planned, EXPECTED).ratios[0]
+    least = RowInformation.of(held.information, planned, EXPECTED).ratios[0]
     expected = EXPECTED * np.sqrt(share * 25.0 / least)
     found = geometry_from_rows(Images(values, planned, np.zeros(3, dtype=bool), WHEN), expected, np.zeros(5), few=True)
     assert found is not None

@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from helpers.misaligned_balls import MATERIAL, PIXEL
 from helpers.moving_balls import beams, series
-from holosplat.align import AlignedBeams, Drift, PoseOptions, Uncertain, align_views
-from holosplat.align.beams import DRIFT, LINEAR, STAY
+from holosplat.align import AlignedBeams, Drift, PoseOptions, PosePrior, align_views
 from holosplat.align.derivatives import NUMBERS
+from holosplat.align.find import DRIFT, LINEAR, STAY
 from holosplat.align.gauge import moved_onto
 from holosplat.align.newton import Normal
 from holosplat.align.series_search import Beams, Moment, SeriesSearch, chosen_moments
@@ -101,7 +101,7 @@ def test_volumes_of_all_times_move_the_beams_together():
     tilts = Rotation.from_rotvec(np.deg2rad([[0, 0, 0], [5, 0, 0], [-4, 0, 0], [3, 0, 0]])).as_matrix()
     planned = replace(planned, views=replace(planned.views, rotations=tilts @ planned.views.rotations))
     scan, true = series(planned, Misalignment(1.0, 0.0, 0.0, seed=2), 2)
-    options = PoseOptions(Uncertain(angle=0.0, roll=0.0), rounds=2, retrieval=10, first=10)
+    options = PoseOptions(PosePrior(angle=0.0, roll=0.0), rounds=2, retrieval=10, first=10)
     found = align_views(scan, PRIOR, options)
     assert apart(scan.exposures[:4], true[:4])[0] > 0.5
     assert apart(found.exposures[:4], true[:4])[0] < 0.2
@@ -112,7 +112,7 @@ def test_the_times_normal_equations_are_those_of_numbers_and_rates(three):
     """A step solves `slope = (numbers + τ rates)` of two times exactly, where the prior is wide."""
     scan, _ = three
     moments = [Moment(scan[[0, 1, 2]].as_static(), np.arange(3), 0.0, when) for when in (-1.0, 0.5)]
-    wide = PoseOptions(Uncertain(100, 20, 20, 0.5, 0.5), drift=Drift(100, 20))
+    wide = PoseOptions(PosePrior(100, 20, 20, 0.5, 0.5), drift=Drift(100, 20))
     search = SeriesSearch(moments, 3, MATERIAL, wide, 1.0)
     r = torch.Generator().manual_seed(0)
     numbers, rates = (1e-2 * torch.randn(3, len(NUMBERS), generator=r, dtype=torch.float64) for _ in range(2))

@@ -8,7 +8,7 @@ import torch
 
 from helpers.misaligned_balls import MATERIAL
 from helpers.moving_balls import beams, series
-from holosplat.align import Drift, PoseOptions, Uncertain
+from holosplat.align import Drift, PoseOptions, PosePrior
 from holosplat.align.derivatives import NUMBERS
 from holosplat.align.newton import Normal
 from holosplat.align.poses import DISTANCE, MAGNIFICATION, Level, PoseSearch
@@ -16,7 +16,7 @@ from holosplat.align.series_search import Moment, SeriesSearch
 from holosplat.beamline.misalignment import Misalignment
 
 WHENS, ORDERS = (-1.0, 0.5), ([2, 0, 1], [0, 1, 2])
-WIDE = PoseOptions(Uncertain(100, 20, 20, 0.5, 0.5, 0.1), drift=Drift(100, 20))
+WIDE = PoseOptions(PosePrior(100, 20, 20, 0.5, 0.5, 0.1), drift=Drift(100, 20))
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +74,7 @@ def test_what_is_held_stays(search):
 
 
 def test_what_is_not_uncertain_does_not_drift(moments):
-    known = PoseOptions(Uncertain(shift=0.0), drift=Drift(100, 20))
+    known = PoseOptions(PosePrior(shift=0.0), drift=Drift(100, 20))
     search = SeriesSearch(moments, 3, MATERIAL, known, 1.0)
     search.solve(said(1e-2), turning=True)
     assert not search.rates[:, :2].any()

@@ -12,7 +12,7 @@ from torch.nn.functional import interpolate, pad
 
 from helpers.discs import ball_lines
 from helpers.misaligned_balls import BALLS, MATERIAL, PIXEL, scan_of
-from holosplat.align import AlignedViews, PoseOptions, Uncertain, align_views
+from holosplat.align import AlignedViews, PoseOptions, PosePrior, align_views
 from holosplat.align.derivatives import NUMBERS, Predicted, in_pixels, projections
 from holosplat.align.gauge import moved_onto
 from holosplat.align.initial_geometry import mirrored, shifts_by_mass
@@ -44,7 +44,7 @@ def apart(found: Exposures, true: Exposures) -> tuple[float, float, float]:
 @pytest.fixture(scope="module")
 def misaligned() -> tuple[Scan, Exposures, AlignedViews]:
     scan, true = scan_of(Misalignment(1.0, 0.6, 0.02, seed=2))
-    options = PoseOptions(Uncertain(distance=0.02), rounds=2, retrieval=20, edges=25)
+    options = PoseOptions(PosePrior(distance=0.02), rounds=2, retrieval=20, edges=25)
     return scan, true, align_views(scan, MaterialPrior.known(MATERIAL), options)
 
 
@@ -66,7 +66,7 @@ def test_surfaces_are_taken_where_matter_has_edges(misaligned):
     my, mx = instrument.margin
     wide = pad(torch.from_numpy(PIXEL * gaussians(in_pixels(true.views))).float(), (mx, mx, my, my))[:, None]
     frames = instrument.frames(LineIntegrals(wide, ((MATERIAL.delta, MATERIAL.beta),)))
-    few = Uncertain(shift=1.0, angle=0.0, roll=0.0)
+    few = PosePrior(shift=1.0, angle=0.0, roll=0.0)
     options = PoseOptions(few, rounds=1, retrieval=8, first=10, steps=4, few_views=2, edges=12)
     found = align_views(Scan(frames.numpy(), true, scan.is_test), MaterialPrior.known(MATERIAL), options)
     assert [one.choice for one in found.decisions if one.name == EDGES] == [VOXELS]
@@ -86,7 +86,7 @@ def test_edges_tell_the_distances_beside_their_mean(misaligned):
 
 def test_distances_are_as_planned_where_no_edges_are_known():
     scan, _ = scan_of(Misalignment(0.0, 0.0, 0.02, seed=2), 6)
-    options = replace(QUICK, uncertain=Uncertain(shift=1.0, angle=0.0, roll=0.0, distance=0.02), rounds=1)
+    options = replace(QUICK, uncertain=PosePrior(shift=1.0, angle=0.0, roll=0.0, distance=0.02), rounds=1)
     found = align_views(scan, MaterialPrior.known(MATERIAL), options)
     np.testing.assert_array_equal(found.exposures.distance, scan.exposures.distance)
     assert any("distances are as planned" in word for word in found.words)
@@ -115,7 +115,7 @@ def test_the_errors_are_those_that_are_said(misaligned):
 
 def test_what_is_said_to_be_known_stays():
     scan, _ = scan_of(Misalignment(1.0, 0.6, 0.0, seed=2), 6)
-    options = replace(QUICK, uncertain=Uncertain(shift=1.0, angle=0.0, roll=0.0))
+    options = replace(QUICK, uncertain=PosePrior(shift=1.0, angle=0.0, roll=0.0))
     found = align_views(scan, MaterialPrior.known(MATERIAL), options)
     np.testing.assert_allclose(found.exposures.views.rotations, scan.views.rotations, atol=1e-12)
     assert np.abs(found.changes[:, :2]).max() > 0.3
@@ -133,7 +133,7 @@ def test_a_good_plan_is_kept():
 def test_large_shifts_begin_with_centres_of_mass():
     """Five pixels are more than the slopes of cells reach; the held-out views are found, too."""
     scan, true = scan_of(Misalignment(4.0, 0.0, 0.0, seed=4), 8)
-    options = replace(QUICK, uncertain=Uncertain(shift=4.0, angle=0.0, roll=0.0), rounds=3)
+    options = replace(QUICK, uncertain=PosePrior(shift=4.0, angle=0.0, roll=0.0), rounds=3)
     found = align_views(scan, MaterialPrior.known(MATERIAL), options)
     assert apart(scan.exposures, true)[0] > 2.5
     assert apart(found.exposures, true)[0] < 0.25
@@ -159,7 +159,7 @@ def test_a_mirrored_beam_is_reported(misaligned):
     frames = scan.frames.copy()
     frames[3] = frames[3, :, ::-1]
     known = Scan(frames, true, scan.is_test)
-    options = replace(QUICK, uncertain=Uncertain(shift=0.2, angle=0.0, roll=0.0), rounds=1)
+    options = replace(QUICK, uncertain=PosePrior(shift=0.2, angle=0.0, roll=0.0), rounds=1)
     found = align_views(known, MaterialPrior.known(MATERIAL), options)
     assert [word for word in found.words if "mirrored" in word] == ["view 3 looks mirrored: reverse its columns"]
 
@@ -176,7 +176,7 @@ def test_few_training_frames_do_not_judge_what_was_found(monkeypatch, enough, ke
     worse = classmethod(judged)
     monkeypatch.setattr(Judged, "of", worse)
     scan, _ = scan_of(Misalignment(1.0, 0.0, 0.0, seed=2), 5, 6)
-    options = replace(QUICK, uncertain=Uncertain(angle=0.0, roll=0.0), rounds=1, few_views=enough)
+    options = replace(QUICK, uncertain=PosePrior(angle=0.0, roll=0.0), rounds=1, few_views=enough)
     found = align_views(scan, MaterialPrior.known(MATERIAL), options)
     assert found.changes.any() == kept
 
@@ -188,7 +188,7 @@ def test_few_views_do_not_tell_turns_from_depth():
     with pytest.raises(InputError, match="2 training frames"):
         align_views(scan[[0, 2]].with_split(np.array([False, True])), MaterialPrior.known(MATERIAL))
     with pytest.raises(InputError, match="shift"):
-        Uncertain(shift=-1.0)
+        PosePrior(shift=-1.0)
 
 
 PLACES, WIDTH = ((4.0, -3.0, 5.0), (-6.0, 2.0, 1.0)), 3.0

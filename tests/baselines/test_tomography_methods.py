@@ -18,7 +18,7 @@ from holosplat.baselines.tomography import TotalVariation, misfit_spectrum, tota
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
 from holosplat.projectors.voxels import LatticeProjector, SliceProjector
-from holosplat.projectors.voxels.slices import slice_matrix
+from holosplat.projectors.voxels.slices import voxel_shadows
 
 # --- filtered back-projection -------------------------------------------------------------------------------
 
@@ -90,7 +90,7 @@ def dense(views: Views) -> tuple[np.ndarray, np.ndarray, Grid]:
     flat = Views(views.rotations, views.shifts / PITCH, views.shape, 1.0)
     grid = Grid.of_views(flat)
     lines = np.random.default_rng(0).uniform(0, 3, (len(views), 1, views.shape[1]))
-    return slice_matrix(grid, flat).toarray(), lines, Grid.of_views(views)
+    return voxel_shadows(grid, flat).toarray().T.astype(float), lines, Grid.of_views(views)
 
 
 def test_sirt_is_that_of_gregor_and_benson():

@@ -9,8 +9,7 @@ import pytest
 
 from helpers.imaging import cells, taken
 from holosplat.beamline.light import EVEN_LIGHT, UnevenLight, correlated_field
-from holosplat.beamline.polychromatic import frames_by_energy, polychromatic_frames
-from holosplat.beamline.simulate import Simulation, simulate, simulated_frames
+from holosplat.beamline.simulate import Simulation, frames_by_energy, polychromatic_frames, simulate, simulated_frames
 from holosplat.checks import InputError
 from holosplat.optics.coherence import Spectrum
 

@@ -11,7 +11,7 @@ import torch
 import holosplat as hs
 from helpers.contract import MATERIAL, PHOTOGRAPHS, PITCH, QUICK, SCENE, SHAPE, run, usable
 from holosplat.model import Instrument, Model
-from holosplat_bench.suite.method import Method
+from holosplat_bench.suite.method import BenchMethod
 from holosplat_bench.suite.methods import METHODS
 
 pytestmark = pytest.mark.usefixtures("decided")
@@ -32,7 +32,7 @@ def results() -> dict[str, Made]:
 
 
 @pytest.fixture(params=list(METHODS))
-def method(request) -> Method:
+def method(request) -> BenchMethod:
     """Each method, if what it needs is installed."""
     return usable(request.param, QUICK)
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 import holosplat as hs
 from helpers.contract import MATERIAL, PITCH, QUICK, QUICKER, SCENE, SHAPE, run, usable
-from holosplat_bench.suite.method import Method
+from holosplat_bench.suite.method import BenchMethod
 from holosplat_bench.suite.methods import METHODS
 
 pytestmark = pytest.mark.usefixtures("decided")
@@ -21,7 +21,9 @@ def unequal() -> hs.Scan:
     return hs.simulate(SCENE, hs.Exposures.of(views, 20.0, 0.02), oversample=2, is_test=np.arange(5) == 4)
 
 
-def result_or_reason(method: Method, scan: hs.Scan, prior: hs.MaterialPrior | None = None) -> hs.volume.Object | str:
+def result_or_reason(
+    method: BenchMethod, scan: hs.Scan, prior: hs.MaterialPrior | None = None
+) -> hs.volume.Object | str:
     """What the method makes of the scan, or why it cannot."""
     try:
         return run(method, scan, prior=prior)

@@ -18,10 +18,10 @@ from holosplat.beamline.misalignment import Misalignment
 from holosplat.matter import Matter
 from holosplat.representations.voxels import VoxelGrid
 from holosplat.specimens.red_cells import icosphere
-from holosplat_bench.suite.aligners import by_mass, by_reprojection
+from holosplat_bench.suite.method import by_mass, by_reprojection
 from holosplat_bench.suite.methods import ALIGNED, METHODS
-from holosplat_bench.suite.moved import Move, judged_with
 from holosplat_bench.suite.prepare import described, fingerprint
+from holosplat_bench.suite.run import Move, judged_with
 
 pytestmark = pytest.mark.usefixtures("unjudged_runs")
 
@@ -75,7 +75,7 @@ def test_steps_of_a_move_follow_each_other(monkeypatch):
     """Each turns and moves what those before have moved."""
     turn, by, steps = Rotation.from_rotvec([0.3, -0.2, 0.4]).as_matrix(), np.array([2.0, -1.0, 0.5]), iter(range(99))
     still = (np.eye(3), np.zeros(3))
-    monkeypatch.setattr("holosplat_bench.suite.moved._step", lambda *rest: (turn, by) if next(steps) < 2 else still)
+    monkeypatch.setattr("holosplat_bench.suite.run._step", lambda *rest: (turn, by) if next(steps) < 2 else still)
     grid = hs.Grid.centred((9, 10, 11), PITCH, (0.0, 0.0, 0.0))
     truth = balls().voxelise(grid)
     found, point = Move.best(truth, truth), np.array([3.0, 4.0, -2.0])

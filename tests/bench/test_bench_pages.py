@@ -13,21 +13,20 @@ from matplotlib.text import Text
 from helpers.bench_rows import failed, make, results, row
 from holosplat.checks import InputError
 from holosplat.io.json import write_json
-from holosplat_bench.suite.folder import BenchFolder
-from holosplat_bench.suite.pages.marks import marks_of
+from holosplat_bench.suite.folder import REFERENCE, BenchFolder
 from holosplat_bench.suite.pages.page import escaped
 from holosplat_bench.suite.pages.pictures import Shown, holograms_figure, slices_figure
 from holosplat_bench.suite.pages.plots import (
     SMALLEST,
     curves_figure,
     deficit,
+    marks_of,
     overview_figure,
     pareto_front,
     tradeoff_figure,
 )
 from holosplat_bench.suite.pages.report import write_bench_report
 from holosplat_bench.suite.pages.results import DICE, ERROR, SSIM
-from holosplat_bench.suite.rows import REFERENCE
 
 # --- plots --------------------------------------------------------------------------------------------------
 

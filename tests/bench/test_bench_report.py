@@ -7,9 +7,9 @@ import math
 import pytest
 
 from helpers.bench_rows import failed, results, row
+from holosplat_bench.suite.folder import REFERENCE
+from holosplat_bench.suite.pages.report import beaten_table, case_table, summary_table, verdict, wins_table
 from holosplat_bench.suite.pages.results import BYTES, ERROR, MEASURES, SECONDS, SSIM, beaten
-from holosplat_bench.suite.pages.text import beaten_table, case_table, summary_table, verdict, wins_table
-from holosplat_bench.suite.rows import REFERENCE
 
 MEAN, RESOLUTION = MEASURES[5], MEASURES[6]
 

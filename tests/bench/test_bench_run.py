@@ -20,13 +20,11 @@ from holosplat.optics.sampling import fringe_sampling
 from holosplat.representations.voxels import VoxelGrid
 from holosplat.specimens.phantoms import star_of_balls
 from holosplat.workflows.evaluate import score_object
-from holosplat_bench.suite import record, references
-from holosplat_bench.suite.folder import BenchFolder
+from holosplat_bench.suite import references, run
+from holosplat_bench.suite.folder import BenchFolder, Row, read_row, write_row
 from holosplat_bench.suite.prepare import fingerprint, prepared
 from holosplat_bench.suite.references import REFERENCES
-from holosplat_bench.suite.rows import Row, read_row, write_row
-from holosplat_bench.suite.run import Suite, run_suite
-from holosplat_bench.suite.sizes import contrast_by_size
+from holosplat_bench.suite.run import Suite, contrast_by_size, run_suite
 
 pytestmark = pytest.mark.usefixtures("unjudged_runs")
 
@@ -102,12 +100,12 @@ def test_the_size_of_a_result_is_what_it_says_or_unknown(recorder, tmp_path):
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux says what a process holds")
 def test_memory_is_counted_to_its_peak():
-    with record.memory_growth() as growth:
+    with run.memory_growth() as growth:
         np.ones(10_000_000)
         grown = growth()
     assert grown is not None
     assert 60e6 < grown < 200e6
-    with record.memory_growth() as growth:
+    with run.memory_growth() as growth:
         grown = growth()
     assert grown is not None
     assert grown < 20e6

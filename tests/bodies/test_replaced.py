@@ -11,7 +11,7 @@ from helpers.motion_shadows import FLOW, OTHER, TURN, cell, pose, shadows
 from holosplat.bodies import neighbourhood_search
 from holosplat.bodies.neighbourhood_search import NeighbourhoodSearch, Pool, best_choice
 from holosplat.bodies.poses import FREER, Explained
-from holosplat.bodies.templates import Search, Templates
+from holosplat.bodies.templates import Templates, TemplateSearch
 
 
 def test_a_choice_is_the_best_of_all():
@@ -42,7 +42,7 @@ def test_a_body_that_stands_for_two_is_replaced_by_them(monkeypatch):
     truth = [pose(TURN, (1.0, 0.0, -7.0)), pose(OTHER, (-1.0, 1.0, 7.0), 1.1)]
     seen = shadows(truth)
     every = Explained(cell(), seen)
-    search = Search(Templates.of(cell(), seen), seen, FLOW[None])
+    search = TemplateSearch(Templates.of(cell(), seen), seen, FLOW[None])
     begun = every.improved([pose(TURN, (0.0, 0.5, 0.0))], 15)
     heard: list[float] = []
     found = NeighbourhoodSearch(every, search, 1).better(begun, on_progress=heard.append)
@@ -56,7 +56,7 @@ def test_a_body_that_stands_for_two_is_replaced_by_them(monkeypatch):
 def test_nothing_becomes_nothing():
     seen = shadows([])
     every = Explained(cell(), seen)
-    assert NeighbourhoodSearch(every, Search(Templates.of(cell(), seen), seen, FLOW[None])).better([]) == []
+    assert NeighbourhoodSearch(every, TemplateSearch(Templates.of(cell(), seen), seen, FLOW[None])).better([]) == []
 
 
 def test_doubts_are_where_something_is_missing():

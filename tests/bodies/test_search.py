@@ -9,11 +9,10 @@ import pytest
 
 from helpers.motion_shadows import FLOW, OTHER, TURN, cell, pose, shadows
 from holosplat.bodies import neighbourhood_search
-from holosplat.bodies.neighbourhood_search import pursued
+from holosplat.bodies.neighbourhood_search import exchanged, pursued
 from holosplat.bodies.poses import Explained, Pose
-from holosplat.bodies.pursuit import exchanged
 from holosplat.bodies.search import best_size
-from holosplat.bodies.templates import Search, Templates
+from holosplat.bodies.templates import Templates, TemplateSearch
 from holosplat.fit.running import Steps
 
 
@@ -48,7 +47,7 @@ def test_a_search_begins_with_what_is_known_where_that_explains_more(monkeypatch
     seen = shadows(truth)
     monkeypatch.setattr(neighbourhood_search, "PATIENCE", 1)
     assert not pursued(cell(), seen, FLOW[None], [astray])[1]
-    monkeypatch.setattr(Search, "tops", lambda *given: [])
+    monkeypatch.setattr(TemplateSearch, "tops", lambda *given: [])
     found, of_begun = pursued(cell(), seen, FLOW[None], [*near, astray])
     assert of_begun
     assert len(found) == 2
@@ -61,7 +60,7 @@ def test_ghosts_are_exchanged_for_bodies():
     truth = [pose(TURN, (6.0, 0.0, -5.0)), pose(OTHER, (-6.0, 1.0, 5.0), 1.2)]
     seen = shadows(truth)
     every = Explained(cell(), seen)
-    search = Search(Templates.of(cell(), seen), seen, FLOW[None])
+    search = TemplateSearch(Templates.of(cell(), seen), seen, FLOW[None])
     ghosts = [pose(TURN, (6.0, 0.5, 5.0)), pose(OTHER, (-6.0, 0.5, -5.0))]
     found = exchanged(every, search, every.improved(ghosts, 8))
     for one in truth:

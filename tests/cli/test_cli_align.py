@@ -13,7 +13,7 @@ import holosplat as hs
 from helpers.cli import FORMULA, QUICK, holosplat, known, refused, worked
 from helpers.contact import PIXEL, contact_scan
 from helpers.moving_balls import beams, series
-from holosplat.align import PoseOptions, Uncertain
+from holosplat.align import PoseOptions, PosePrior
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.cli.options import PriorOptions
 from holosplat.io.nxtomo import read_scan, write_scan
@@ -80,7 +80,7 @@ def test_a_run_refines_its_geometry_and_keeps_it(shop, tmp_path):
     assert "not the scan" not in worked(holosplat("evaluate", run, "--json")).err
     worked(holosplat("render", run, "--scan", path, "--split", "all", "--out", frames))
     np.testing.assert_allclose(read_scan(frames).views.shifts, found, atol=1e-12)
-    refine = PoseOptions(Uncertain(angle=0.0, roll=0.0))
+    refine = PoseOptions(PosePrior(angle=0.0, roll=0.0))
     options = {"matter": "levels", "refine": refine, "folder": RunFolder(run), "resume": True}
     again = hs.reconstruct(
         planned, PriorOptions(("haemoglobin",)).prior(planned.exposures.reference_energy), QUICK, 5, **options

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import h5py
@@ -52,6 +54,13 @@ def test_a_scan_is_described(shop):
     assert "of memory" in found["continuous matter"][0]
     assert "missing" not in found
     assert found["next"] == [f"holosplat reconstruct {shop.scan} --out run"]
+
+
+@pytest.mark.parametrize("kind", ["truth", "run"])
+def test_volumes_and_runs_are_described_before_torch_would_be_imported(shop, kind):
+    """PyTorch takes longer to import than all else."""
+    program = "import sys; from holosplat.report.info import info; info(sys.argv[1]); sys.exit('torch' in sys.modules)"
+    subprocess.run([sys.executable, "-c", program, str(getattr(shop, kind))], check=True)
 
 
 def test_all_that_is_missing_is_said_at_once_with_its_options(shop, tmp_path):

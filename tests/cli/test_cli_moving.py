@@ -15,7 +15,7 @@ from holosplat.io.reading import Reading
 from holosplat.io.volumes import read_volume
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import SmoothVolume
-from holosplat.motion.flow_reconstruction import CarriedOptions, Search
+from holosplat.motion.flow_reconstruction import FlowOptions, FlowSearch
 from holosplat.optics.background import LightOptions
 from holosplat.representations import MovingGaussians, SpaceTimeField
 from holosplat.workflows.moving import reconstruct_moving
@@ -24,7 +24,7 @@ from holosplat.workflows.run_folder import RunFolder
 
 pytestmark = pytest.mark.usefixtures("unjudged_runs")
 
-QUICK = CarriedOptions(
+QUICK = FlowOptions(
     volume=SmoothVolume(coarser=(), rounds=1, iterations=4),
     cells=2,
     most_degree=0,
@@ -79,7 +79,7 @@ def test_a_series_in_motion_is_one_object_that_all_commands_read(quick):
 def test_a_run_that_was_cut_off_goes_on(quick, monkeypatch):
     """Ctrl-C after two steps; the same command with --resume ends it, one with another seed is refused."""
     asked = ["reconstruct", quick / "s.nxs", "--material", "PMMA", "--time-frame", "all", "--out", quick / "run"]
-    keep, kept = Search.keep, list[int]()
+    keep, kept = FlowSearch.keep, list[int]()
 
     def broken_off(search, state=None):
         keep(search, state)
@@ -88,7 +88,7 @@ def test_a_run_that_was_cut_off_goes_on(quick, monkeypatch):
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(Search, "keep", broken_off)
+        patch.setattr(FlowSearch, "keep", broken_off)
         outcome = holosplat(*asked)
     assert outcome.code == 130
     assert "--resume" in outcome.err

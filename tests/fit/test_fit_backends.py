@@ -58,10 +58,10 @@ def a_fit(backend: str, channels: int = 1, objective: Objective = EVERYTHING, ra
 
 
 def run(fit: Fit) -> tuple[list[dict[str, float]], list[Tensor]]:
-    """Every record, and the parameters at the end."""
+    """Every record, and the parameters at the end, in main memory."""
     records: list[dict[str, float]] = []
     fit.run(records.append)
-    return records, list(fit.result().parameters().values())
+    return records, [parameter.cpu() for parameter in fit.result().parameters().values()]
 
 
 class Waits(TorchDispatchMode):

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from holosplat_bench.suite.folder import BenchFolder
+from holosplat_bench.suite.folder import BenchFolder, Row
 from holosplat_bench.suite.pages.results import read_results
-from holosplat_bench.suite.rows import Row
 
 FAMILIES = {"fbp": "tomography", "sirt-nonneg": "tomography", "gaussians": "Gaussians", "neural-field": "neural"}
 

@@ -15,7 +15,7 @@ from holosplat.matter import Matter
 from holosplat.methods import Task
 from holosplat.representations.voxels import VoxelGrid
 from holosplat.specimens.red_cells import icosphere
-from holosplat_bench.suite.method import Method
+from holosplat_bench.suite.method import BenchMethod
 from holosplat_bench.suite.run import Suite
 
 MATERIAL = hs.DeltaBeta(2e-7, 2e-10)
@@ -70,20 +70,20 @@ class Recorder:
     def __init__(self) -> None:
         self.calls: list[tuple[str, hs.Scan, hs.MaterialPrior, int]] = []
 
-    def method(self, name: str, act: Callable[[hs.Scan], hs.volume.Object] = voxels) -> Method:
+    def method(self, name: str, act: Callable[[hs.Scan], hs.volume.Object] = voxels) -> BenchMethod:
         def start(task: Task) -> hs.volume.Object:
             task.on_progress("thinking", 0.5)
             self.calls.append((name, task.scan, task.prior, task.seed))
             return act(task.scan)
 
-        return Method(name, "fakes", f"a fake called {name}", Fake(start))
+        return BenchMethod(name, "fakes", f"a fake called {name}", Fake(start))
 
     @property
     def names(self) -> list[str]:
         return [name for name, *_ in self.calls]
 
 
-def suite(methods: list[Method], cases=("round",), seeds=(3,), load=make_case) -> Suite:
+def suite(methods: list[BenchMethod], cases=("round",), seeds=(3,), load=make_case) -> Suite:
     return Suite(cases, seeds, {method.name: method for method in methods}, {}, load)
 
 

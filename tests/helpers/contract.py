@@ -16,7 +16,7 @@ from holosplat.methods import AlignedFit, Onix, PixelNerf, SmoothVolume
 from holosplat.representations import AlignedNetwork, Encoding, Network
 from holosplat.specimens.red_cells import icosphere
 from holosplat_bench.opponents.photographs import AlphaRates, AlphaSplats, RadianceFields
-from holosplat_bench.suite.method import Method
+from holosplat_bench.suite.method import BenchMethod
 from holosplat_bench.suite.methods import METHODS, methods
 from holosplat_bench.suite.methods import PHOTOGRAPHS as PHOTOGRAPHIC
 
@@ -65,7 +65,7 @@ def two_balls() -> hs.Scan:
     return hs.simulate(SCENE, exposures, oversample=2)
 
 
-def usable(name: str, methods: dict[str, Method]) -> Method:
+def usable(name: str, methods: dict[str, BenchMethod]) -> BenchMethod:
     """The method, if what it needs is installed; else the test is skipped."""
     package = NEEDS.get(name)
     if package and importlib.util.find_spec(package) is None:
@@ -73,7 +73,7 @@ def usable(name: str, methods: dict[str, Method]) -> Method:
     return methods[name]
 
 
-def run(method: Method, scan: hs.Scan, seed: int = 0, prior: hs.MaterialPrior | None = None) -> hs.volume.Object:
+def run(method: BenchMethod, scan: hs.Scan, seed: int = 0, prior: hs.MaterialPrior | None = None) -> hs.volume.Object:
     """What the method makes of the training frames; not judged, but for the first result of test_bench_contract.py."""
     known = hs.MaterialPrior.known(MATERIAL)
     with unjudged():

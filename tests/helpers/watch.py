@@ -17,6 +17,7 @@ class Watch(TorchDispatchMode):
         waits = name in ("_local_scalar_dense", "nonzero", "masked_select", "unique_dim", "is_nonzero", "equal")
         assert not waits, f"{name} waits for the device"
         out = func(*args, **(kwargs or {}))
-        places = {a.device for a in (*args, out) if isinstance(a, Tensor)}
+        copies = name in ("_to_copy", "copy_")  # all others take a single number from main memory as an argument
+        places = {a.device for a in (*args, out) if isinstance(a, Tensor) and (copies or a.ndim)}
         assert len(places) <= 1, f"{name} moves {places}"
         return out

@@ -10,8 +10,7 @@ from types import ModuleType
 
 import pytest
 
-from holosplat_bench.suite.folder import BenchFolder
-from holosplat_bench.suite.rows import Row
+from holosplat_bench.suite.folder import BenchFolder, Row
 
 TEST = {"ssim": 0.9, "frcm": 0.8}
 VOLUME = {"dice": 0.95, "relative_error_delta": 0.1}

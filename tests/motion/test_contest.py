@@ -14,9 +14,8 @@ from helpers.moving_ellipsoids import MATERIAL, scan, true_paths
 from holosplat.checks import InputError
 from holosplat.inference import Decision, Score
 from holosplat.learning.weights import Card, Trained
-from holosplat.motion import body_tracker, model_comparison
-from holosplat.motion.model_comparison import NAME, Parts, compared_kinds, unexplained
-from holosplat.motion.track import TrackOptions, follow
+from holosplat.motion import body_tracker, track
+from holosplat.motion.track import NAME, NamedJournal, TrackOptions, compared_kinds, follow, unexplained
 
 
 class Run:
@@ -47,7 +46,7 @@ class Run:
 )
 def test_what_leaves_less_is_kept(monkeypatch, cells, other, kept, looked):
     spread = 1 + 0.05 * np.random.default_rng(0).normal(size=(40, 3))
-    monkeypatch.setattr(model_comparison, "unexplained", lambda run: Score(run.left**2 * spread))
+    monkeypatch.setattr(track, "unexplained", lambda run: Score(run.left**2 * spread))
     runs = Run("cells", cells or 0.0, cells is None), Run("other", other)
     said = compared_kinds(*runs)  # type: ignore[arg-type]
     assert said.startswith(kept)
@@ -117,14 +116,11 @@ def test_nobody_asks_for_cells_elsewhere(guessed, monkeypatch):
     follow(two_beams(), MATERIAL, short())
 
 
-def test_a_journal_of_parts():
-    kept = Kept()
-    parts = Parts(kept)
-    parts.of("any").save({"next": "stiff"})
-    parts.of("cells").save({"next": "soft"})
-    again = Parts(kept)
-    assert again.of("any").load() == {"next": "stiff"}
-    assert again.of("cells").load() == {"next": "soft"}
-    assert Parts(Kept()).of("any").load() is None
+def test_a_journal_of_several():
+    kept, states, stages = Kept(), {}, {"any": {"next": "stiff"}, "cells": {"next": "soft"}}
+    for name, state in stages.items():
+        NamedJournal(kept, states, name).save(state)
+    assert {name: NamedJournal(kept, kept.load(), name).load() for name in stages} == stages  # type: ignore[arg-type]
+    assert NamedJournal(Kept(), {}, "any").load() is None
     with pytest.raises(InputError, match="checkpoint"):
-        Parts(Kept(["no table"]))  # type: ignore[list-item]
+        follow(two_beams(), MATERIAL, short(), journal=Kept(["no table"]))  # type: ignore[arg-type]

@@ -17,7 +17,7 @@ from holosplat.geometry import Grid
 from holosplat.io.objects import read_object, write_object
 from holosplat.matter import MaterialPrior
 from holosplat.methods import SmoothVolume, Task
-from holosplat.motion.flow_reconstruction import CarriedOptions, Search, merged
+from holosplat.motion.flow_reconstruction import FlowOptions, FlowSearch, merged
 from holosplat.representations import Fading, Flow, Lattice, TimeBasis
 from holosplat.representations.flow import fading_factor
 
@@ -55,8 +55,8 @@ def test_gaussians_fade_as_the_field_says():
         assert found.numpy() == pytest.approx(fading_factor(fading.at(centres), later).numpy(), rel=bound)
 
 
-def search(scan, spread: float) -> Search:
-    how = CarriedOptions(
+def search(scan, spread: float) -> FlowSearch:
+    how = FlowOptions(
         volume=QUICK,
         cells=2,
         most_cells=2,
@@ -68,7 +68,7 @@ def search(scan, spread: float) -> Search:
         spacing_px=1.0,
         fading=spread,
     )
-    return Search(Task(scan, MaterialPrior.known(MATTER)), MATTER, how)
+    return FlowSearch(Task(scan, MaterialPrior.known(MATTER)), MATTER, how)
 
 
 def test_the_gradient_is_that_of_finite_differences():
@@ -131,4 +131,4 @@ def test_fadings_that_do_not_fit_are_refused():
     with pytest.raises(InputError, match="a fading must have coefficients of the shape"):
         Fading(torch.zeros(2, 3, 3, 3), LATTICE)
     with pytest.raises(InputError, match="fading"):
-        replace(CarriedOptions(), fading=-1.0)
+        replace(FlowOptions(), fading=-1.0)

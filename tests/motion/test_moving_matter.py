@@ -14,7 +14,7 @@ from holosplat.fit.whitened import WhitenedFrames
 from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta, MaterialPrior, Matter
 from holosplat.methods import SmoothVolume, Task
-from holosplat.motion.flow_reconstruction import MOTION, STILL, CarriedOptions, Search
+from holosplat.motion.flow_reconstruction import MOTION, STILL, FlowOptions, FlowSearch
 from holosplat.motion.freer_flow import of_degree, on_lattice
 from holosplat.motion.timed_frames import merged
 from holosplat.representations import Flow, Lattice, TimeBasis, VoxelGrid
@@ -60,10 +60,10 @@ def drifting() -> tuple[CarriedScene, Scan]:
     return series((4e-6, -2e-6, 3e-6))
 
 
-def search(scan: Scan, **options: object) -> Search:
+def search(scan: Scan, **options: object) -> FlowSearch:
     usual = {"cells": 2, "most_degree": 0, "most_cells": 2, "steps": 2, "iterations": 6, "final": 16, "most_final": 24}
-    how = CarriedOptions(**{**usual, "volume": QUICK, "spacing_px": 1.0, **options})  # pyright: ignore[reportArgumentType]
-    return Search(Task(scan, MaterialPrior.known(MATTER)), MATTER, how)
+    how = FlowOptions(**{**usual, "volume": QUICK, "spacing_px": 1.0, **options})  # pyright: ignore[reportArgumentType]
+    return FlowSearch(Task(scan, MaterialPrior.known(MATTER)), MATTER, how)
 
 
 def error(found: hs.volume.Volume, true: hs.volume.Volume) -> float:
@@ -192,4 +192,4 @@ def test_turns_have_no_strain_and_shears_do():
 
 def test_options_that_cannot_be_are_refused():
     with pytest.raises(InputError, match="strain must be above zero"):
-        CarriedOptions(strain=0.0)
+        FlowOptions(strain=0.0)

@@ -11,11 +11,11 @@ from helpers.kept import Kept
 from holosplat.checks import InputError
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import SmoothVolume, Task
-from holosplat.motion.flow_reconstruction import Carried, CarriedOptions, Search
+from holosplat.motion.flow_reconstruction import FlowOptions, FlowResult, FlowSearch
 from holosplat.scan import Exposures, Scan
 
 MATTER = DeltaBeta(8e-7, 8e-10)
-QUICK = CarriedOptions(
+QUICK = FlowOptions(
     volume=SmoothVolume(coarser=(), rounds=1, iterations=3), cells=2, most_degree=1, most_cells=3, steps=2,
     iterations=2, final=2, most_final=4, spacing_px=2.0, approximate_steps=3,
 )  # fmt: skip
@@ -29,8 +29,8 @@ def scan() -> Scan:
     return hs.simulate(scene, exposures, photons_per_pixel=800.0, seed=1, is_test=np.zeros(len(exposures), dtype=bool))
 
 
-def found(scan: Scan, journal: Kept) -> Carried:
-    search = Search(Task(scan, MaterialPrior.known(MATTER), seed=2), MATTER, QUICK, journal)
+def found(scan: Scan, journal: Kept) -> FlowResult:
+    search = FlowSearch(Task(scan, MaterialPrior.known(MATTER), seed=2), MATTER, QUICK, journal)
     search.take_up()
     return search.run()
 

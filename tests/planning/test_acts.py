@@ -17,12 +17,12 @@ from holosplat.align import PoseOptions
 from holosplat.geometry import Views
 from holosplat.learning.network import FINE, Size
 from holosplat.methods import METHODS, Pinn, SurfaceOptions
-from holosplat.motion.flow_reconstruction import CarriedOptions
+from holosplat.motion.flow_reconstruction import FlowOptions
 from holosplat.motion.track_options import TrackOptions
 from holosplat.planning import acts
 from holosplat.planning.needs import Needs, Sizes, coarser, of_fit, of_reconstruction
 from holosplat.scan import Exposures
-from holosplat_bench.suite.needs import of_benchmark, of_methods
+from holosplat_bench.suite.methods import of_benchmark, of_methods
 
 ROOT = Path(__file__).resolve().parents[2]
 TABLE = ROOT / "docs/data/needs_acts.csv"
@@ -61,7 +61,7 @@ def series(shape: tuple[int, int], views: int, times: int) -> Exposures:
 FRAMES: dict[str, Callable[[Exposures], Needs | None]] = {
     "track": lambda seen: acts.of_track(seen, TrackOptions()),
     "forecast": lambda seen: acts.of_forecast(seen, 16),
-    "matter in motion": lambda seen: acts.of_motion(seen, CarriedOptions()),
+    "matter in motion": lambda seen: acts.of_motion(seen, FlowOptions()),
     "pinn": lambda seen: acts.of_space_time(seen, Pinn()),
     "each time": lambda seen: acts.of_each_time(seen, METHODS["gaussians"], "levels"),
     "align": lambda seen: acts.of_alignment(seen, PoseOptions()),

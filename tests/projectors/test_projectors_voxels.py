@@ -19,10 +19,11 @@ from holosplat.projectors.voxels import (
     LatticeProjector,
     SliceProjector,
     projector_for,
+    slices,
     voxel_line_integrals,
 )
 from holosplat.projectors.voxels.lattice import lattice_reference
-from holosplat.projectors.voxels.slices import slice_matrix
+from holosplat.projectors.voxels.slices import voxel_shadows
 
 UNEVEN = Grid((11, 7, 9), (1.1, 0.8, 0.9), (-4.0, -2.9, -3.7))
 CUBES = Grid((11, 7, 9), (1.0, 1.0, 1.0), (-4.0, -3.0, -4.7))
@@ -85,7 +86,7 @@ def test_the_lattice_equals_its_float64_twin(views, threads):
 def test_slices_equal_their_float64_twin_for_any_number_of_threads(rows):
     """Fewer slices than a kernel takes at a time, as many, and more; with empty voxels, which are passed over."""
     grid, views = Grid((11, rows, 9), (1.1, 1.0, 0.9), (-4.0, 0.5 - 0.5 * rows, -4.7)), around(5, (rows, 12))
-    matrix = torch.from_numpy(slice_matrix(grid, views).toarray()).double()
+    matrix = torch.from_numpy(voxel_shadows(grid, views).toarray().T).double()
     volume, lines = randoms(11, 9, rows), randoms(5, 12, rows)
     volume[3:, 2:] = 0
     wanted = (matrix @ volume.reshape(99, rows), matrix.T @ lines.reshape(60, rows))
@@ -98,6 +99,15 @@ def test_slices_equal_their_float64_twin_for_any_number_of_threads(rows):
         for array, truth in zip(found[0], wanted):
             assert float((array.double().reshape(truth.shape) - truth).abs().max() / truth.abs().max()) < 1e-6
         assert all(torch.equal(a, b) for other in found[1:] for a, b in zip(found[0], other))
+
+
+def test_a_matrix_and_its_transpose_are_made_of_the_same_shadows(monkeypatch):
+    """Of many views they take longer to make than some products with them."""
+    made = []
+    monkeypatch.setattr(slices, "voxel_shadows", lambda *given: made.append(given) or voxel_shadows(*given))
+    monkeypatch.setattr(slices, "SMALL", 0)
+    SliceProjector(CUBES, around(3, (7, 12)), "reference")
+    assert len(made) == 1
 
 
 @pytest.mark.parametrize("projector", [kind(CUBES, around(3, (7, 12))) for kind in (SliceProjector, LatticeProjector)])

@@ -15,7 +15,7 @@ from holosplat.checks import InputError
 from holosplat.geometry import Grid, Poses
 from holosplat.projectors.voxels import LatticeProjector, SliceProjector, projector_for
 from holosplat.projectors.voxels.lattice import lattice_reference
-from holosplat.projectors.voxels.slices import slice_matrix
+from holosplat.projectors.voxels.slices import voxel_shadows
 
 UNEVEN = Grid((11, 7, 9), (1.1, 0.8, 0.9), (-4.0, -2.9, -3.7))
 ALIGNED = Grid((8, 6, 10), (1.0, 1.0, 1.0), (-4.5, -2.5, -3.5))
@@ -128,7 +128,7 @@ def test_slices_equal_their_float64_twin(gpu, rows, width):
     """A narrow detector, and more slices than a program takes."""
     grid = Grid((5, rows, 4), (1.1, 1.0, 0.9), (-1.7, 0.5 - 0.5 * rows, -1.7))
     views = around(3, (rows, width), 0.3)
-    matrix = torch.from_numpy(slice_matrix(grid, views).toarray()).double()
+    matrix = torch.from_numpy(voxel_shadows(grid, views).toarray().T).double()
     volume, lines = randoms(5, 4, rows), randoms(3, width, rows)
     projector = SliceProjector(grid, views, "cuda")
     found = (projector.project(volume.float().to(gpu)), projector.backproject(lines.float().to(gpu)))

@@ -28,6 +28,7 @@ def few_programs(gpu, monkeypatch):
 
         monkeypatch.setattr(triton_surface, "DRAWN", 1024)
         monkeypatch.setattr(triton_surface, "GATHERED", 1024)
+        monkeypatch.setattr(triton_surface, "POSED", 1024)
 
 
 def leaves_of(mesh, shape: tuple[int, int], gpu: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -70,6 +71,7 @@ def test_several_programs_share_the_faces(gpu, monkeypatch):
 
     monkeypatch.setattr(triton_surface, "DRAWN", 32)
     monkeypatch.setattr(triton_surface, "GATHERED", 128)
+    monkeypatch.setattr(triton_surface, "POSED", 64)
     vertices = COARSE.vertices.to(gpu)
     faces = torch.cat([COARSE.faces, COARSE.faces.roll(1, 1)]).to(gpu)  # 200 faces, no multiple of a block
     points = torch.stack([vertices + 11.3, vertices.flip(1) + 9.0])

@@ -17,9 +17,8 @@ from helpers.series import planned
 from holosplat.checks import InputError, MissingError
 from holosplat.io.json import write_json
 from holosplat.series import run as running
-from holosplat.series.clusters import ranges_of, run_on_dask, script_of
 from holosplat.series.folder import FAILED, SeriesFolder
-from holosplat.series.run import Counts, run_processes
+from holosplat.series.run import Counts, ranges_of, run_on_dask, run_processes, script_of
 from holosplat.series.settings import Slurm
 
 
@@ -163,7 +162,7 @@ def test_a_cluster_of_dask_does_the_tasks(fresh, done):
 
 def test_without_dask_or_without_a_scheduler(fresh, monkeypatch):
     if shutil.which("true") and "distributed" in sys.modules:
-        monkeypatch.setattr("holosplat.series.clusters.CONNECT_SECONDS", 0.2)
+        monkeypatch.setattr("holosplat.series.run.CONNECT_SECONDS", 0.2)
         with pytest.raises(InputError, match="must be the address of a Dask scheduler"):
             run_on_dask(fresh, "tcp://127.0.0.1:9")
     monkeypatch.setitem(sys.modules, "distributed", None)

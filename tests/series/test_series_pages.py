@@ -21,9 +21,8 @@ from holosplat.io.nxtomo import write_scan
 from holosplat.report.tables import Headline
 from holosplat.representations import MovingSurfaces
 from holosplat.series.collect import collect, same_bodies
-from holosplat.series.folder import SeriesFolder, table_of, time_left
+from holosplat.series.folder import SeriesFolder, duration, table_of, time_left
 from holosplat.series.page import Frame, Point, SeriesPage, chart, headline, labels, render_page
-from holosplat.series.rows import duration
 from holosplat.series.run import run_left, states
 from holosplat.series.time import PHASE
 from holosplat.workflows.reconstruction import Reconstruction

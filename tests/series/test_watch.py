@@ -15,8 +15,7 @@ from holosplat.checks import InputError
 from holosplat.io.reading import Reading
 from holosplat.series import watch as watching
 from holosplat.series.appearing import Folder
-from holosplat.series.watch import Watch, Watching
-from holosplat.series.watch_folder import WatchFolder
+from holosplat.series.watch import Watch, WatchFolder, Watching
 
 
 class World:

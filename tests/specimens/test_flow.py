@@ -11,9 +11,16 @@ import torch
 from holosplat.checks import InputError
 from holosplat.specimens.flow.channel import Channel
 from holosplat.specimens.flow.contacts import Repulsion, contact_forces, wall_forces
-from holosplat.specimens.flow.integrate import State, Stepper
-from holosplat.specimens.flow.stokeslets import BLOB, CHUNK, mutual_velocity, stokeslet_velocity
-from holosplat.specimens.flow.suspension import Medium, Suspension
+from holosplat.specimens.flow.suspension import (
+    BLOB,
+    CHUNK,
+    Medium,
+    State,
+    Stepper,
+    Suspension,
+    mutual_velocity,
+    stokeslet_velocity,
+)
 from holosplat.specimens.membrane.model import Membrane
 from holosplat.specimens.membrane.resting import geodesic_sphere, resting_cell
 

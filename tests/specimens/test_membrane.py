@@ -12,7 +12,7 @@ from scipy.integrate import quad
 from holosplat.checks import InputError
 from holosplat.mesh import TriangleMesh
 from holosplat.specimens.membrane import energies
-from holosplat.specimens.membrane.measures import elongation, gyration_axes, shape_change
+from holosplat.specimens.membrane.geometry import elongation, gyration_axes, shape_change
 from holosplat.specimens.membrane.model import Elasticity, Membrane
 from holosplat.specimens.membrane.rest import RestShape
 from holosplat.specimens.membrane.resting import geodesic_sphere, resting_cell

@@ -14,11 +14,11 @@ from holosplat.checks import InputError
 from holosplat.io.reading import Reading
 from holosplat.io.table import Table
 from holosplat.projectors.surface import surface_thickness
-from holosplat.series.rows import Row, read_row, write_row
+from holosplat.report.info import facts_of_run
+from holosplat.series.folder import Row, read_row, write_row
 from holosplat.specimens.red_cells import icosphere
 from holosplat.workflows.preconditions import require_alike
 from holosplat.workflows.run_folder import RunFolder
-from holosplat.workflows.run_status import facts_of_run
 
 OLD_RUN = Path(__file__).resolve().parents[1] / "data/run_0_1_0"
 ROW = Row(3, "scan", 0, 0.5, "done", test={"ssim": 0.9, "psnr": "inf"}, bodies=((1e-6, 2e-6, 3e-6, 4e-18),))

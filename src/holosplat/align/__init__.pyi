@@ -1,12 +1,12 @@
 from .axis import Axis as Axis
 from .axis import AxisOptions as AxisOptions
 from .axis import find_axis as find_axis
-from .beams import AlignedBeams as AlignedBeams
 from .calibration import Calibrated as Calibrated
 from .calibration import CalibrationOptions as CalibrationOptions
 from .calibration import calibrate as calibrate
+from .find import AlignedBeams as AlignedBeams
 from .find import align_views as align_views
 from .poses import Drift as Drift
 from .poses import PoseOptions as PoseOptions
-from .poses import Uncertain as Uncertain
+from .poses import PosePrior as PosePrior
 from .views import AlignedViews as AlignedViews

@@ -141,12 +141,12 @@ def _search_axis(scan: Scan, sinograms: Sinograms, options: AxisOptions, on_prog
     """The axis of sinograms of `scan`."""
     width, columns = scan.views.shape[1], sinograms.values.shape[-1]
     factor, pitch = max(1, columns // 64), scan.views.shape[1] / columns
-    first = Search.of(
+    first = AxisSearch.of(
         sinograms.binned(factor), 0.0, options.within * width, 0.5 * factor * pitch, lambda f: on_progress(0.5 * f)
     )
     near, lean = first.likeliest()
     reach = (2 * factor + FINE_REACH) * pitch + abs(lean) * 0.5 * float(np.ptp(sinograms.heights))
-    fine = Search.of(sinograms, near, reach, STEP * pitch, lambda f: on_progress(0.5 + 0.5 * f))
+    fine = AxisSearch.of(sinograms, near, reach, STEP * pitch, lambda f: on_progress(0.5 + 0.5 * f))
     offset, leaning = fine.found(lean)
     middle = 0.5 * (width - 1) - float(scan.views.shifts[0, 0]) / scan.views.pixel_size
     return Axis(offset, leaning, middle + offset.value, scan.views.shape[0])
@@ -192,7 +192,7 @@ LEANS = 24
 
 
 @dataclass(frozen=True)
-class Search:
+class AxisSearch:
     """Residuals with the axis at each of T offsets.
 
     offsets: [T], evenly spaced [pixels]
@@ -209,7 +209,7 @@ class Search:
     heights: np.ndarray
 
     @classmethod
-    def of(cls, sinograms: Sinograms, near: float, reach: float, step: float, on_progress: Advance) -> Search:
+    def of(cls, sinograms: Sinograms, near: float, reach: float, step: float, on_progress: Advance) -> AxisSearch:
         """Offsets within `reach` of `near`, `step` apart [pixels]."""
         count = max(2, int(np.ceil(reach / step)))
         offsets = near + step * np.arange(-count, count + 1)

@@ -24,7 +24,7 @@ from .derivatives import NUMBERS
 from .gauge import moved_onto
 from .initial_geometry import shifts_by_mass
 from .phantom import STEPS, Linear, Phantom, find_beads, linearised, placed, solved
-from .poses import DISTANCE, FLUX, SHIFT, TURN, Uncertain
+from .poses import DISTANCE, FLUX, SHIFT, TURN, PosePrior
 from .shadows import EVEN_OR_NOT
 from .views import KINDS
 
@@ -48,7 +48,7 @@ NAMES = {"shift": "shifts", "angle": "turns across the beam", "roll": "roll", "d
 class CalibrationOptions:
     """How a calibration proceeds."""
 
-    uncertain: Uncertain = field(default_factory=lambda: Uncertain(5.0, 2.0, 2.0, 0.05))
+    uncertain: PosePrior = field(default_factory=lambda: PosePrior(5.0, 2.0, 2.0, 0.05))
     """What is not known of each view, and by how much."""
     pixel: float = 0.0
     """Standard deviation of the pixel size, as a share of it (0: it is known)."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..checks import InputError, require, shaped
 from ..scan import Scan
-from .poses import Uncertain
+from .poses import PosePrior
 from .views import AlignedViews
 
 REFINED = {
@@ -20,7 +20,7 @@ REFINED = {
     "distance": "distance",
     "magnification": "magnification",
 }
-"""What may be refined, by the name of its field in `Uncertain`."""
+"""What may be refined, by the name of its field in `PosePrior`."""
 TEXTS = ("refined", "words")
 
 
@@ -57,7 +57,7 @@ class Geometry:
                 object.__setattr__(self, each.name, array)
 
     @classmethod
-    def of_training(cls, scan: Scan, found: AlignedViews, uncertain: Uncertain) -> Geometry:
+    def of_training(cls, scan: Scan, found: AlignedViews, uncertain: PosePrior) -> Geometry:
         """That of `scan` whose training frames were `found`; held-out ones are as planned until they are placed."""
         count, train, planned = len(scan), np.flatnonzero(~scan.is_test), scan.exposures
         refined = tuple(name for name, field in REFINED.items() if getattr(uncertain, field) > 0)
@@ -136,7 +136,7 @@ class Geometry:
         return [said.rstrip(";"), *self.words]
 
 
-def wanted(names: str, uncertain: Uncertain) -> Uncertain:
+def wanted(names: str, uncertain: PosePrior) -> PosePrior:
     """`uncertain` with only what `names` says, of `REFINED` with commas between; errors: `InputError`."""
     chosen = [name.strip() for name in names.split(",")]
     unknown = [name for name in chosen if name not in REFINED]

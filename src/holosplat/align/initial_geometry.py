@@ -15,7 +15,7 @@ from ..matter import DeltaBeta
 from ..optics.retrieval import Tikhonov, tikhonov
 from ..scan import Scan
 from .derivatives import in_pixels
-from .null_space import Told
+from .null_space import RowInformation
 from .row_sums import FACTOR, RowEstimate, RowPrior, by_rows, plane_angles
 
 BY = "the same rows"
@@ -142,18 +142,18 @@ def geometry_from_rows(images: Images, expected: np.ndarray, drifts: np.ndarray,
     images, sides, first, compared = _upright(images, train, RowPrior.of(held, len(train)))
     turned = ", ".join(f"beam {v} along {side}" for v, side in enumerate(sides) if side)
     decision = Decision(REVERSED, turned or NONE, BY, compared)
-    told, free = Told.of(first.information, images.views[train], expected), held
+    told, free = RowInformation.of(first.information, images.views[train], expected), held
     if few and len(told.ratios) and told.ratios[0] >= FIRMLY:
         free = expected
     prior = replace(
         RowPrior.of(free, len(train)), drifts=drifts * (free > 0), begin=np.stack([first.numbers, first.rates])
     )
     found = images.estimate(prior, train)
-    told = Told.of(found.information, images.views[train], expected)
+    told = RowInformation.of(found.information, images.views[train], expected)
     whole = images.estimate(_of_others(found, free, images.is_test), everything)
     errors, rate_errors = _errors(whole), np.zeros((len(images.views), len(free)))
     errors[train] = told.errors
-    rate_errors[train] = Told.of(found.rate_information, images.views[train], prior.drifts).errors
+    rate_errors[train] = RowInformation.of(found.rate_information, images.views[train], prior.drifts).errors
     errors[:, free == 0] = expected[free == 0]
     return RowGeometry(
         whole.numbers[:, : len(free)],

@@ -27,7 +27,7 @@ PART = 0.35
 
 
 @dataclass(frozen=True)
-class Told:
+class RowInformation:
     """Information of rows on the 5 parameters of V views (`NAMES`), up to a motion of the whole object.
 
     errors: [V, 5] standard errors, with what is expected
@@ -40,7 +40,7 @@ class Told:
     combinations: np.ndarray
 
     @classmethod
-    def of(cls, information: np.ndarray, views: Views, expected: np.ndarray) -> Told:
+    def of(cls, information: np.ndarray, views: Views, expected: np.ndarray) -> RowInformation:
         """information: [V · 6, V · 6] of a `RowEstimate`; views: planned, lengths in pixels; expected: [5] standard
         deviations, 0 for what is known."""
         count = len(views)

@@ -32,7 +32,7 @@ SHIFT, TURN, DISTANCE, MAGNIFICATION, FLUX = slice(0, 2), slice(2, 5), 5, 6, 7
 
 @dataclass(frozen=True)
 @ranged
-class Uncertain:
+class PosePrior:
     """Standard deviations of what is not known of each view; 0: it is as planned."""
 
     shift: Pixels = 2.0
@@ -90,7 +90,7 @@ class Drift:
             require(value <= most, f"drift {name} must be {most:g} at most, but it is {value:g}; correct it.")
 
     def pose(self, pixels: float = 1.0) -> np.ndarray:
-        """Standard deviations [5] of half the way, by which the ends differ from the middle, as `Uncertain.pose`."""
+        """Standard deviations [5] of half the way, by which the ends differ from the middle, as `PosePrior.pose`."""
         half = 0.5 * np.array([self.shift / pixels, np.deg2rad(self.angle)])
         return half[[0, 0, 1, 1, 1]]
 
@@ -115,7 +115,7 @@ class Level:
 class PoseOptions:
     """How poses are looked for."""
 
-    uncertain: Uncertain = field(default_factory=Uncertain)
+    uncertain: PosePrior = field(default_factory=PosePrior)
     """What is not known, and by how much."""
     rounds: int = 8
     """Rounds of volume and poses on each size of pixels, at most."""

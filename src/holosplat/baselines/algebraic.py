@@ -44,13 +44,14 @@ def sirt(
     on_progress: Advance,
     *,
     options: Algebraic = Algebraic(),
+    missing: Tensor | None = None,
 ) -> Tensor:
     """Occupancy [Z, Y, X] on `grid` from thickness `lines` [V, H, W] in metres, by SIRT from zero; float32.
 
     `x ← x + ω C Aᵀ R (b - A x)` with R and C one over the sums of A's rows and columns (Gregor & Benson 2008, eq. 2),
     then the bounds: `upper`, and zero if `options.nonnegative`.
     """
-    top, rays = checked_upper(upper), rays_of(lines, views, grid)
+    top, rays = checked_upper(upper), rays_of(lines, views, grid, missing=missing)
     with memory_kept():
         return _simultaneous(rays, top, on_progress, options)
 
@@ -58,8 +59,9 @@ def sirt(
 def _simultaneous(rays: Rays, top: float | None, on_progress: Advance, options: Algebraic) -> Tensor:
     projector, lowest = rays.projector, 0.0 if options.nonnegative else None
     volume = torch.zeros(projector.array_shape)
-    per_ray = _reciprocal(projector.project(torch.ones_like(volume)))
-    per_voxel = _reciprocal(projector.backproject(torch.ones_like(rays.measured))).mul_(options.relaxation)
+    known = torch.ones_like(rays.measured) if rays.known is None else rays.known
+    per_ray = _reciprocal(projector.project(torch.ones_like(volume))).mul_(known)
+    per_voxel = _reciprocal(projector.backproject(known)).mul_(options.relaxation)
     for done in range(options.sweeps):
         on_progress(done / options.sweeps)
         missing = (rays.measured - projector.project(volume)).mul_(per_ray)
@@ -76,6 +78,7 @@ def art(
     on_progress: Advance,
     *,
     options: Algebraic = Algebraic(sweeps=40, relaxation=0.5, nonnegative=True),
+    missing: Tensor | None = None,
 ) -> Tensor:
     """Occupancy [Z, Y, X] on `grid` from thickness `lines` [V, H, W] in metres, by ART from zero; float32.
 
@@ -84,7 +87,7 @@ def art(
     Views follow each other by the golden section, so that successive ones differ. Bounds are imposed after each view
     (the same authors' partially constrained ART: not below zero, unless `options` say otherwise).
     """
-    top, rays = checked_upper(upper), rays_of(lines, views, grid)
+    top, rays = checked_upper(upper), rays_of(lines, views, grid, missing=missing)
     lowest = 0.0 if options.nonnegative else None
     with memory_kept():
         steps = _orthogonal_sets(rays)
@@ -117,7 +120,8 @@ def _orthogonal_sets(rays: Rays) -> list[_View]:
         # in one set, A Aᵀ is diagonal: applied to the set itself it gives the |aᵢ|²
         sets = [projector.lines_in(mask) for mask in _masks(rays)]
         squares = [projector.project(projector.backproject(mask)) for mask in sets]
-        scales = [mask * _reciprocal(square) for mask, square in zip(sets, squares)]
+        known = 1.0 if rays.known is None else rays.known[v : v + 1]
+        scales = [mask * _reciprocal(square) * known for mask, square in zip(sets, squares)]
         found.append(_View(projector, rays.measured[v : v + 1], scales))
     return found
 

@@ -12,7 +12,9 @@ from torch import Tensor
 from ..checks import require
 from ..geometry import Grid, Views
 from ..progress import Advance
+from ..projectors.voxels import projector_for
 from ..ranges import ranged
+from .algebraic import Algebraic, sirt
 from .rays import bounded, checked_upper, in_pixels
 
 
@@ -39,12 +41,14 @@ def filtered_backprojection(
     on_progress: Advance,
     *,
     options: Ramp = Ramp(),
+    missing: Tensor | None = None,
 ) -> Tensor:
     """Occupancy [Z, Y, X] on `grid` from thickness `lines` [V, H, W] in metres; float32.
 
     Each view is filtered by the band-limited ramp, weighted by half the gaps to its neighbours' angles (so that uneven
     ones are right), and smeared back by linear interpolation (Kak & Slaney 1988, eqs. 3.23 to 3.30). Values above
-    `upper` are cut. Views without a common axis are refused.
+    `upper` are cut. Views without a common axis are refused. A filter needs all rays: those of missing pixels take what
+    the volume of the others by `sirt` says.
     """
     require(
         views.shares_axis,
@@ -52,10 +56,21 @@ def filtered_backprojection(
         "take sirt, art or tv.",
     )
     pitch, top = views.pixel_size, checked_upper(upper)
+    if missing is not None:
+        lines = torch.where(missing, _explained(lines, views, grid, missing), lines)
     views, grid = in_pixels(lines, views, grid)
     filtered = _filtered(lines.float() / pitch, options) * angular_weights(views)[:, None, None]
     volume = _smeared(filtered, views, grid, on_progress)
     return bounded(volume, 0.0 if options.nonnegative else None, top)
+
+
+def _explained(lines: Tensor, views: Views, grid: Grid, missing: Tensor) -> Tensor:
+    """Lines [V, H, W] in metres of the volume that SIRT makes of those that are not missing."""
+    options = Algebraic(nonnegative=True)
+    volume = sirt(lines, views, grid, None, lambda fraction: None, options=options, missing=missing)
+    pixels, voxels = in_pixels(lines, views, grid)
+    projector = projector_for(voxels, pixels)
+    return projector.lines_out(projector.project(projector.volume_in(volume))).to(lines) * views.pixel_size
 
 
 def angular_weights(views: Views) -> Tensor:

@@ -137,8 +137,8 @@ def retrieved(
     matter goes on above and below the frames."""
     backend, noise = resolve(options.backend), correlated(light)
     how = Tikhonov(iterations=options.retrieval, backend=backend, leaves=leaves, noise=noise)
-    report = partial(on_progress, "phase retrieval")
-    return tikhonov(torch.from_numpy(scan.frames), scan.exposures, *material, options=how, on_progress=report)
+    known = {"options": how, "missing": scan.gaps, "on_progress": partial(on_progress, "phase retrieval")}
+    return tikhonov(torch.from_numpy(scan.frames), scan.exposures, *material, **known)
 
 
 def agreed(
@@ -223,8 +223,10 @@ def _volume_of(
     lines: Tensor, scan: Scan, material: DeltaBeta, options: HolographicTV, on_progress: Progress
 ) -> PrimalDual:
     """Total variation on the thickness [V, H, W] of views, which may have rows beyond the frames."""
-    field = scan.views.taller((lines.shape[1] - scan.views.shape[0]) // 2)
-    rays = rays_of(lines, field, Grid.of_views(field), options.backend)
+    beyond = (lines.shape[1] - scan.views.shape[0]) // 2
+    field, gaps = scan.views.taller(beyond), scan.gaps
+    gaps = None if gaps is None else carried_on(gaps.float(), beyond) > 0
+    rays = rays_of(lines, field, Grid.of_views(field), options.backend, gaps)
     first = min(TotalVariation.first, options.iterations)
     known = {"still_light": options.still_light, "misfit": options.misfit}
     inside = options.inside / scan.views.finest
@@ -285,6 +287,7 @@ def _agree(
     finer = math.ceil(fringe_sampling(scan.exposures) / refine)
     instrument = Instrument(scan.exposures, refine * finer, backend=options.backend)
     frames = torch.from_numpy(scan.frames).to(instrument.device)
+    gaps = None if scan.gaps is None else scan.gaps.to(instrument.device)
     beside = None if light is None or light.background is None else SolvedLight(light.background, frames, light.air)
     grid = Grid.of_views(views, refine)
     projector = projector_for(grid, views.refined(refine), options.backend)
@@ -296,7 +299,7 @@ def _agree(
         lines = solver.lines()
         predicted = frames_of(instrument, refined(lines, finer) * pitch, material).detach()
         lit = predicted if beside is None else predicted * beside.factor(images=predicted)
-        missing = frames - lit
+        missing = frames - lit if gaps is None else (frames - lit).masked_fill(gaps, 0.0)
         misfit = float(missing.square().sum())
         if misfit < least or done <= options.settling:
             best, least = solver.volume.clone(), misfit

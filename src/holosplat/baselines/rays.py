@@ -28,7 +28,8 @@ class Rays:
     """What tomography works on; lengths are in detector pixels, the smallest ones where they differ.
 
     measured: line integrals in the projector's order; views, grid: in pixels, the views on the raster of the grid's
-    voxels; refine: voxels along a pixel's edge.
+    voxels; refine: voxels along a pixel's edge; known: 0 for the rays of missing pixels and 1 for others, in the
+    projector's order; None: all are 1.
     """
 
     projector: SliceProjector | LatticeProjector
@@ -36,11 +37,16 @@ class Rays:
     views: Views
     grid: Grid
     refine: int
+    known: Tensor | None = None
+
+    def gaps(self) -> Tensor | None:
+        """Rays [V, H, W] bool of missing pixels."""
+        return None if self.known is None else self.projector.lines_out(self.known) < 0.5
 
 
-def rays_of(lines: Tensor, views: Views, grid: Grid, backend: str = "cpu") -> Rays:
+def rays_of(lines: Tensor, views: Views, grid: Grid, backend: str = "cpu", missing: Tensor | None = None) -> Rays:
     """Line integrals [V, H, W] in metres and where they were taken, made ready for voxels of `grid`, where `backend`
-    (resolved) computes.
+    (resolved) computes. missing: pixels [V, H, W] bool without a value.
 
     Where the voxels are finer than pixels, lines are interpolated (bilinearly) to a raster of the voxels' pitch.
     """
@@ -54,8 +60,11 @@ def rays_of(lines: Tensor, views: Views, grid: Grid, backend: str = "cpu") -> Ra
     if refine > 1:
         views = views.refined(refine)
         images = interpolate(images[None], scale_factor=refine, mode="bilinear", align_corners=False)[0]
-    projector = projector_for(grid, views, backend)
-    return Rays(projector, projector.lines_in(images), views, grid, refine)
+    projector, known = projector_for(grid, views, backend), None
+    if missing is not None:
+        wide = missing.repeat_interleave(refine, 1).repeat_interleave(refine, 2)
+        known = projector.lines_in((~wide).float().to(images.device))
+    return Rays(projector, projector.lines_in(images), views, grid, refine, known)
 
 
 def in_pixels(lines: Tensor, views: Views, grid: Grid) -> tuple[Views, Grid]:

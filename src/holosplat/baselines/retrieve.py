@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from ..checks import InputError
@@ -34,6 +36,7 @@ def retrieve(
     method: str = "tikhonov",
     *,
     light: LightOptions = EVEN_OR_NOT,
+    missing: np.ndarray | None = None,
     on_progress: Advance = lambda fraction: None,
 ) -> Retrieved:
     """Retrieve the phase and the projected thickness of one material from single frames [V, H, W], each by itself.
@@ -43,6 +46,7 @@ def retrieve(
     method: one of `optics.retrieval.RETRIEVALS`
     light: if the light is uneven, each frame is divided by it. The light is measured in air and continued smoothly
         behind the object; its uncertainty counts as noise there.
+    missing: pixels [V, H, W] bool without a value (`Scan.missing`), which have no weight
 
     Thickness [m] and phase [rad] of the result are tensors [V, H, W]. Errors: `InputError` for another method, a δ that
     is not above zero, and frames of another shape.
@@ -64,7 +68,8 @@ def retrieve(
         raise InputError(f"method must be one of {', '.join(RETRIEVALS)}, but it is {method!r}.")
     known = checked(frames, exposures, material.delta)
     found = Light.of(known, light)
-    how = {} if found.background is None else {"options": RETRIEVAL_OPTIONS[method](noise=found.doubt)}
-    thickness = RETRIEVALS[method](found.evened(known), exposures, *material, **how, on_progress=on_progress)
+    how: dict[str, Any] = {} if found.background is None else {"options": RETRIEVAL_OPTIONS[method](noise=found.doubt)}
+    how |= {"missing": None if missing is None else torch.from_numpy(missing), "on_progress": on_progress}
+    thickness = RETRIEVALS[method](found.evened(known), exposures, *material, **how)
     phase = (-thickness / radian(exposures, material.delta)).to(thickness.dtype)
     return Retrieved(thickness, phase, found)

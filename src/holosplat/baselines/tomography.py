@@ -27,14 +27,36 @@ QUIETEST = 1e-4
 class Tomography(Protocol):
     """(thickness [V, H, W] in metres, their views, grid, upper bound or None, progress) → occupancy [Z, Y, X]."""
 
-    def __call__(self, lines: Tensor, views: Views, grid: Grid, upper: float | None, on_progress: Advance, /) -> Tensor:
-        """The occupancy [Z, Y, X], dimensionless float32, never above `upper`; `on_progress(fraction)` on the way."""
+    def __call__(
+        self,
+        lines: Tensor,
+        views: Views,
+        grid: Grid,
+        upper: float | None,
+        on_progress: Advance,
+        /,
+        *,
+        missing: Tensor | None = None,
+    ) -> Tensor:
+        """The occupancy [Z, Y, X], dimensionless float32, never above `upper`; `on_progress(fraction)` on the way.
+
+        missing: rays [V, H, W] bool of pixels without a value, which have no weight.
+        """
         ...
 
 
-def sirt_nonnegative(lines: Tensor, views: Views, grid: Grid, upper: float | None, on_progress: Advance) -> Tensor:
+def sirt_nonnegative(
+    lines: Tensor,
+    views: Views,
+    grid: Grid,
+    upper: float | None,
+    on_progress: Advance,
+    *,
+    missing: Tensor | None = None,
+) -> Tensor:
     """`sirt` with the occupancy kept from going below zero, which lets it run longer."""
-    return sirt(lines, views, grid, upper, on_progress, options=Algebraic(sweeps=200, relaxation=1.9, nonnegative=True))
+    options = Algebraic(sweeps=200, relaxation=1.9, nonnegative=True)
+    return sirt(lines, views, grid, upper, on_progress, options=options, missing=missing)
 
 
 @dataclass(frozen=True)
@@ -65,6 +87,7 @@ def total_variation(
     on_progress: Advance,
     *,
     options: TotalVariation = TotalVariation(),
+    missing: Tensor | None = None,
 ) -> Tensor:
     """Occupancy [Z, Y, X] ≥ 0 on `grid` from thickness `lines` [V, H, W] in metres, by total variation; float32.
 
@@ -73,7 +96,7 @@ def total_variation(
     the power spectrum of what no volume explains, and S is a power of that.
     """
     with memory_kept():
-        return tv_solver(rays_of(lines, views, grid), upper, options, on_progress).volume
+        return tv_solver(rays_of(lines, views, grid, missing=missing), upper, options, on_progress).volume
 
 
 def tv_solver(
@@ -87,7 +110,7 @@ def tv_solver(
     """The solver of `total_variation` after its last iteration, for those who go on from there.
 
     weights: trust in each ray [V, H, W], above 0; with them, or with still light, frequencies are trusted alike to the
-    end.
+    end. Rays of missing pixels take the line integral of the volume, and so have no weight.
     """
     like = rays.measured
     start, coupling = like.new_zeros(rays.grid.shape), 1 / rays.refine**2
@@ -100,8 +123,11 @@ def tv_solver(
         solver.with_still_light(smooth_modes(rays.views.shape, options.still_light, like.device)[1:])
     alike = weights is not None or options.still_light > 0
     images, total = rays.projector.lines_out(rays.measured), options.first + options.iterations
+    gaps, measured = rays.gaps(), images
     for done in range(total):
         on_progress(done / total)
+        if gaps is not None:
+            images = torch.where(gaps, solver.lines(), measured)
         if done == options.first and options.discount > 0 and not alike:
             solver.discount(misfit_spectrum(rays, solver.lines() - images) ** options.discount)
         if done == options.first and options.misfit > 0:

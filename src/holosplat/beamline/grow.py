@@ -22,8 +22,7 @@ from ..mesh import TriangleMesh
 from ..progress import Advance
 from ..ranges import Seconds, Seed, Small, ranged
 from ..specimens.flow.channel import Channel
-from ..specimens.flow.integrate import State, Stepper
-from ..specimens.flow.suspension import Medium, Suspension
+from ..specimens.flow.suspension import Medium, State, Stepper, Suspension
 from ..specimens.membrane.model import Elasticity, Membrane
 from ..specimens.membrane.resting import resting_cell
 from ..specimens.red_cells import DIAMETER, SHUFFLES, place_cells

@@ -1,18 +1,21 @@
-"""`simulate`: frames of an Object, on a raster fine enough for its fringes, with motion blur and photon noise."""
+"""`simulate`: frames of an Object, on a raster fine enough for its fringes, with motion blur and photon noise, of one
+energy or of a spectrum."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
 
 from ..backends import Backend, device, resolve
-from ..checks import in_range, require
+from ..checks import InputError, in_range, require, require_regular
 from ..memory import memory_kept
 from ..model import Instrument, Model
+from ..optics.coherence import Spectrum
 from ..optics.detector import poisson
 from ..optics.noise import PHOTON_RANGE
 from ..optics.sampling import resolving_oversample
@@ -23,6 +26,7 @@ from ..specimens.mesh_series import MeshSeries
 from ..specimens.scene import MeshScene
 from ..volume import Object
 from .light import EVEN_LIGHT, UnevenLight
+from .scenes import Filling
 
 SIMULATED_FRINGE_SAMPLES = 8
 """Samples on the first fringe in simulations: frames of the benchmark are then right to 1 % of their contrast (rms),
@@ -187,3 +191,62 @@ def simulate(
         on_progress((i + 1) / len(exposures))
     split = interleaved_split(len(exposures)) if is_test is None else is_test
     return Scan(frames, exposures, split, how.provenance(exposures))
+
+
+def polychromatic_frames(
+    matter_at: Callable[[float], Object], spectrum: Spectrum, exposures: Exposures, how: Simulation
+) -> Iterator[np.ndarray]:
+    """Frames [H, W] float32 as `simulate.simulated_frames`, but of light with a `spectrum`.
+
+    `matter_at(energy_kev)` is the object with its δ and β at that energy. A frame is `Σ w_e I_e`, each energy's
+    intensity relative to its own flat; light and photon noise come last. All energies are sampled as the exposures'
+    own is.
+    """
+    quiet = how.quiet(exposures)
+    parts = [
+        simulated_frames(matter_at(energy), replace(exposures, energy_kev=energy, reference_kev=None), quiet)
+        for energy in map(float, spectrum.energies_kev)
+    ]
+    detect = how.detector(exposures)
+    for i, of_energies in enumerate(zip(*parts)):
+        yield detect(np.tensordot(spectrum.weights, np.stack(of_energies), 1), i)
+
+
+def frames_by_energy(
+    matter_at: Callable[[float], Object], exposures: Exposures, how: Simulation
+) -> Iterator[np.ndarray]:
+    """Frames [H, W] float32 as `simulate.simulated_frames`, of exposures of several energies.
+
+    `matter_at(energy_kev)` is the object with its δ and β at that energy; each frame uses its own energy.
+    """
+    quiet = how.quiet(exposures)
+    detect = how.detector(exposures)
+    for i, energy in enumerate(exposures.energy_kev.tolist()):
+        own = replace(exposures[[i]], reference_kev=None)
+        (frame,) = simulated_frames(matter_at(energy), own, quiet)
+        yield detect(frame, i)
+
+
+def refilled(matter: MeshScene | MeshSeries, filling: Filling, energy_kev: float) -> MeshScene | MeshSeries:
+    """The same bodies, filled with their materials' δ and β at `energy_kev` [keV]."""
+    if isinstance(matter, MeshSeries):
+        return replace(matter, snapshots=tuple(_refilled(scene, filling, energy_kev) for scene in matter.snapshots))
+    return _refilled(matter, filling, energy_kev)
+
+
+def _refilled(scene: MeshScene, filling: Filling, energy_kev: float) -> MeshScene:
+    return replace(scene, materials=tuple(filling.of(mesh.name, energy_kev) for mesh in scene.meshes))
+
+
+def read_spectrum(path: Path) -> Spectrum:
+    """A spectrum from a text file of two columns, energy [keV] and weight; `#` begins a comment."""
+    require_regular(path, "a text file of energies and weights (--spectrum)")
+    try:
+        table = np.loadtxt(path, ndmin=2)
+    except (ValueError, UnicodeDecodeError):
+        table = np.empty((0, 0))
+    if table.shape[1] != 2 or len(table) == 0:
+        raise InputError(
+            f"{path} must hold two columns of numbers, energy [keV] and weight, but it does not; correct it."
+        )
+    return Spectrum(table[:, 0], table[:, 1])

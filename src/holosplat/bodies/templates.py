@@ -92,7 +92,7 @@ class Hit:
     velocity: np.ndarray
 
 
-class Search:
+class TemplateSearch:
     """Looks for templates on straight paths of given velocities [K, 3] [pixels per unit of time]."""
 
     def __init__(self, templates: Templates, seen: Shadows, velocities: np.ndarray) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -56,10 +55,10 @@ class UncertainOptions:
 
     def options(self) -> PoseOptions:
         """The options of the search."""
-        from ..align import Drift, PoseOptions, Uncertain
+        from ..align import Drift, PoseOptions, PosePrior
 
         sizes = {name.removeprefix("uncertain_"): value for name, value in vars(self).items() if "drift" not in name}
-        return PoseOptions(Uncertain(**sizes), drift=Drift(self.drift_shift, self.drift_angle))
+        return PoseOptions(PosePrior(**sizes), drift=Drift(self.drift_shift, self.drift_angle))
 
 
 @dataclass(frozen=True)
@@ -89,10 +88,10 @@ class RefineOptions:
             changed = [name.replace("_", "-") for name, value in vars(self).items() if value != usual[name]]
             require(not changed, f"--{', --'.join(changed)} go with --refine, which says what is uncertain; add it.")
             return None
-        from ..align import PoseOptions, Uncertain
+        from ..align import PoseOptions, PosePrior
         from ..align.geometry import wanted
 
-        return PoseOptions(wanted(self.refine, Uncertain(**sizes)))
+        return PoseOptions(wanted(self.refine, PosePrior(**sizes)))
 
 
 def align(
@@ -133,7 +132,7 @@ def align(
     )
     require(table is None or not axis_only, "--table is of single views; leave it, or --axis-only.")
     require(geometry_out is None or reading.part.views is None, "--geometry-out is of all frames; leave --views.")
-    measured, how = read_frames(scan, reading), unknown.options()
+    measured, how = read_frames(scan, reading, joined=False), unknown.options()
     if not axis_only:
         tell_frames("align", measured.exposures, out, lambda seen: of_alignment(seen, how))
     measured = measured.in_memory()
@@ -156,7 +155,8 @@ def align(
         _write_geometry(geometry_out, scan, reading, (measured.exposures[lasting], exposures[lasting]), told, lines[0])
     facts = measured.provenance | {"aligned": lines[0]}
     light = measured.light if frames is measured.source else None  # that of frames which were turned back is not known
-    write_scan(out, Scan.of(frames, exposures, measured.is_test, facts, light))
+    missing = measured.missing if frames is measured.source else None
+    write_scan(out, Scan.of(frames, exposures, measured.is_test, facts, light, missing))
     print(f"wrote {out}: the same {len(measured)} frames, with other exposures", file=sys.stderr)
 
 
@@ -186,7 +186,7 @@ def _write_geometry(
     from ..io.formats import read_as
 
     measured, found = moved
-    whole = read_as(source, replace(reading, part=Part(time_frame=reading.part.time_frame))).exposures
+    whole = read_as(source, replace(reading, part=Part(time_frame=reading.part.time_frame)), joined=False).exposures
     whole = whole[: len(found)]
     scales = found.views.relative / measured.views.relative
     shifts = found.views.shifts - scales[:, None] * (measured.views.shifts - whole.views.shifts)
@@ -203,7 +203,7 @@ def _write_geometry(
 
 def _write_table(path: Path, found: AlignedViews) -> None:
     """A row for each view."""
-    from ..io.atomic import atomic_path
+    from ..io.atomic import write_rows
 
     names = (
         "shift_x_px",
@@ -215,12 +215,11 @@ def _write_table(path: Path, found: AlignedViews) -> None:
         "magnification_share",
     )
     header = ["view", *names, *(f"error_{name}" for name in names), "flux", "before", "after"]
-    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(header)
-        for v in range(len(found.changes)):
-            last = (found.flux[v], found.before[v], found.after[v])
-            writer.writerow([v, *(f"{value:.6g}" for value in (*found.changes[v], *found.errors[v], *last))])
+    last = zip(found.flux, found.before, found.after)
+    rows = (
+        [v, *(f"{value:.6g}" for value in (*found.changes[v], *found.errors[v], *ends))] for v, ends in enumerate(last)
+    )
+    write_rows(path, header, rows)
 
 
 def _ratio(prior: MaterialPrior) -> float | None:

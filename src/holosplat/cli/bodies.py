@@ -58,9 +58,6 @@ class MotionFlags:
     """The same of its area (0: areas are free)."""
     apart: Weight = 0.2
     """How deep bodies may lie in each other, a standard deviation in pixels (0: as they like)."""
-    carrier: Weight = 0.0
-    """Weight of a velocity field without divergence that the bodies share, and whose scatter their velocities tell
-    (0: none; 1: as probabilities have it)."""
     acceleration: float = 1e-6
     """Weight of bent paths (0: as bent as splines can be)."""
     bending: float = 1.0
@@ -77,7 +74,7 @@ class MotionFlags:
         usual = TrackOptions().with_effort(positive("--effort", self.effort))
         paths = replace(usual.paths, degree=self.degree, pieces=self.pieces)
         found = replace(usual.sightings, least_volume=self.least_volume)
-        known = {name: getattr(self, name) for name in ("volume_kept", "area_kept", "apart", "carrier", "acceleration")}
+        known = {name: getattr(self, name) for name in ("volume_kept", "area_kept", "apart", "acceleration")}
         fits = {
             name: replace(fit, objective=replace(fit.objective, bending=self.bending), **known)
             for name, fit in (("stiff", usual.stiff), ("soft", usual.soft), ("half", usual.half))

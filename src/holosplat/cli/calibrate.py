@@ -70,10 +70,10 @@ class DoubtOptions:
 
     def options(self) -> CalibrationOptions:
         """The options of the search."""
-        from ..align import CalibrationOptions, Uncertain
+        from ..align import CalibrationOptions, PosePrior
 
         shift, angle, roll, distance, pixel = vars(self).values()
-        return CalibrationOptions(Uncertain(shift, angle, roll, distance), pixel)
+        return CalibrationOptions(PosePrior(shift, angle, roll, distance), pixel)
 
 
 def calibrate(

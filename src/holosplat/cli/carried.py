@@ -10,7 +10,7 @@ from ..io.reading import Reading
 from ..ranges import Weight, ranged
 
 if TYPE_CHECKING:
-    from ..motion.flow_reconstruction import CarriedOptions
+    from ..motion.flow_reconstruction import FlowOptions
 
 
 @dataclass(frozen=True)
@@ -36,11 +36,11 @@ class CarriedFlags:
         taken = {"still": "still", "each": "each", "flow": "all", "bodies": None}[self.motion]
         return replace(reading, part=replace(reading.part, time_frame=taken))
 
-    def options(self) -> CarriedOptions:
+    def options(self) -> FlowOptions:
         """The options of the method."""
-        from ..motion.flow_reconstruction import CarriedOptions
+        from ..motion.flow_reconstruction import FlowOptions
 
-        return CarriedOptions(fading=self.fading)
+        return FlowOptions(fading=self.fading)
 
     def require_all(self, reading: Reading) -> None:
         """`InputError` where something of it is asked of one time."""

@@ -138,7 +138,7 @@ def convert(
 
 def _read(source: Path, reading: Reading) -> Scan:
     """The scan at `source`, which may be a folder of another program."""
-    scan = read_as(source, reading)
+    scan = read_as(source, reading, joined=False)
     if loader_of(source).name == "r2-gaussian":
         _say(f"{source} has no phase: transmission exp(-p) in contact, where a density of 1 has beta "
              f"{scan.provenance['beta_of_density_1']}; reconstruct it with --delta-beta 1, and read beta")  # fmt: skip

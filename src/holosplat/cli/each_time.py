@@ -12,9 +12,8 @@ from ..io.formats import read_frames
 from ..io.reading import Reading
 from ..matter import MaterialPrior
 from ..series.collect import collect
-from ..series.folder import SeriesFolder
+from ..series.folder import SeriesFolder, line_of
 from ..series.plan import plan_series
-from ..series.rows import line_of
 from ..series.run import run_left
 from ..series.settings import Cut, Settings
 from .progress import INTERRUPTED

@@ -13,7 +13,7 @@ from ..io.reading import Reading
 from ..io.run_scan import run_source
 from ..matter import KnownSeveral, MaterialPrior, MatterKind
 from ..methods import Auto, Method
-from ..motion.flow_reconstruction import CarriedOptions
+from ..motion.flow_reconstruction import FlowOptions
 from ..optics.background import LightOptions
 from ..planning.acts import of_motion
 from ..report.run import report_run
@@ -45,7 +45,7 @@ def reconstruct_in_motion(
     reading: Reading,
     prior: MaterialPrior,
     folder: RunFolder,
-    how: tuple[int, LightOptions, CarriedOptions],
+    how: tuple[int, LightOptions, FlowOptions],
     *,
     resume: bool = False,
 ) -> bool:

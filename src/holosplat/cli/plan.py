@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import sys
 from dataclasses import asdict, dataclass
@@ -266,15 +264,10 @@ def _numbers(values: dict[str, Any]) -> dict[str, Any]:
 
 def _write(path: Path, surveyed: Survey) -> None:
     """The picture and the table of a survey."""
-    from ..io.atomic import atomic_path
+    from ..io.atomic import atomic_path, write_rows
     from ..report.plan import survey_figure  # matplotlib, which most plans need not
 
-    text = io.StringIO()
     rows = surveyed.table()
-    table = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    table.writeheader()
-    table.writerows({name: f"{value:.6g}" for name, value in row.items()} for row in rows)
-    with atomic_path(path.with_suffix(".csv")) as temporary:
-        temporary.write_text(text.getvalue(), encoding="utf-8")
+    write_rows(path.with_suffix(".csv"), list(rows[0]), ([f"{v:.6g}" for v in row.values()] for row in rows))
     with atomic_path(path) as temporary:
         survey_figure(surveyed).savefig(temporary, format="png", dpi=200, metadata={"Software": None})

@@ -88,6 +88,7 @@ def retrieve(
             material,
             method,
             light=illumination.options(),
+            missing=measured.missing,
             on_progress=lambda fraction: bar.show("phase retrieval", fraction, {}),
         )
     words = found.light.in_words

@@ -20,8 +20,7 @@ from .places import Output, with_checked_arguments
 from .progress import INTERRUPTED
 
 if TYPE_CHECKING:
-    from ..series.folder import SeriesFolder
-    from ..series.rows import Row
+    from ..series.folder import Row, SeriesFolder
     from ..series.run import Counts
     from ..series.settings import Settings
 
@@ -89,7 +88,7 @@ class SlurmFlags(Slurm):
 
     def carry_out(self, folder: SeriesFolder, retry: bool) -> None:
         """Write the script, and submit it if that is asked for."""
-        from ..series.clusters import submit, write_script
+        from ..series.run import submit, write_script
 
         count, numbers = write_script(folder, self, retry)
         _say(f"wrote {folder.script} for {count} task(s): {numbers}")
@@ -180,7 +179,7 @@ def run(
         elif task is not None:
             counts = counted([run_task(series, task, _tell_row)])
         elif dask is not None:
-            from ..series.clusters import run_on_dask
+            from ..series.run import run_on_dask
 
             counts = run_on_dask(series, dask, retry, lambda state: _say(f"task {state.number}: {state.state}"))
         elif jobs:
@@ -194,7 +193,7 @@ def run(
 
 
 def _tell_row(row: Row) -> None:
-    from ..series.rows import line_of
+    from ..series.folder import line_of
 
     _say(line_of(row))
 
@@ -231,8 +230,7 @@ def collect(folder: Positional[Path]) -> None:
         folder: Folder of the series.
     """
     from ..series.collect import collect as join
-    from ..series.folder import SeriesFolder
-    from ..series.rows import some
+    from ..series.folder import SeriesFolder, some
 
     found = join(series := SeriesFolder(folder))
     for path in (series.table, series.bodies, series.page):

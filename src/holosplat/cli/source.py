@@ -53,7 +53,7 @@ class SourceOptions:
 
     def light(self, energy_kev: float) -> Spectrum | None:
         """The spectrum about `energy_kev` [keV]; None for one energy."""
-        from ..beamline.polychromatic import read_spectrum
+        from ..beamline.simulate import read_spectrum
         from ..optics.coherence import Spectrum
 
         require(self.bandwidth is None or self.spectrum is None, "give --bandwidth or --spectrum, not both.")
@@ -87,8 +87,7 @@ class SourceOptions:
         self, matter: Still | MeshSeries, filling: Filling, exposures: Exposures, how: Simulation
     ) -> Iterator[np.ndarray]:
         """Frames [H, W] of `matter`, one after another."""
-        from ..beamline.polychromatic import polychromatic_frames, refilled
-        from ..beamline.simulate import simulated_frames
+        from ..beamline.simulate import polychromatic_frames, refilled, simulated_frames
         from ..specimens.mesh_series import MeshSeries
         from ..specimens.scene import MeshScene
 

@@ -202,7 +202,7 @@ class GeneratedOptions:
         self, beamline: BeamlineOptions, filling: Filling, duration: float = 0.0
     ) -> ContinuousScene | CarriedScene:
         """A specimen that ends in the beamline's field of view; duration: from the first frame to the last [s]."""
-        from ..specimens import soft_matter, soft_motion
+        from ..specimens import carried, soft_matter
 
         assert self.specimen is not None
         pixel = beamline.pixel_size
@@ -214,10 +214,10 @@ class GeneratedOptions:
         cores, goes = self._cores(filling, beamline.energy_kev), self.specimen_motion
         if self.specimen == "stirred-blob":
             turn = math.radians(60.0 if goes is None else goes)
-            return soft_motion.stirred_blob(size, matter, seed, turn, duration)
+            return carried.stirred_blob(size, matter, seed, turn, duration)
         if self.specimen == "collapsing-foam":
             lost = 0.5 if goes is None else goes
-            return soft_motion.collapsing_foam(size, matter, seed, lost, duration, count, edge)
+            return carried.collapsing_foam(size, matter, seed, lost, duration, count, edge)
         if self.specimen == "soft-cells":
             return soft_matter.soft_cells(count, (0.2 * size, 0.35 * size), box, matter, seed, edge)
         if self.specimen == "round-cell":

@@ -11,8 +11,7 @@ from tyro.conf import Positional
 from ..checks import require
 from ..io.reading import Reading
 from ..ranges import Seed
-from ..series.watch import Watch, Watching
-from ..series.watch_folder import WatchFolder
+from ..series.watch import Watch, WatchFolder, Watching
 from ..tables import to_table
 from .light import RunLightFlags
 from .options import MethodOptions, PriorOptions

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -178,12 +179,19 @@ class Prediction:
         return Model(self.object, instrument, alignment, light)
 
 
-def residuals(said: Prediction, measured: Tensor, noise: Tensor, allowance: Allowance = Allowance()) -> Residuals:
+def residuals(
+    said: Prediction,
+    measured: Tensor,
+    noise: Tensor,
+    allowance: Allowance = Allowance(),
+    missing: Tensor | None = None,
+) -> Residuals:
     """The residuals of a prediction of `measured` frames [V, h, w], whose noise has the power `noise` [V, h, w//2 + 1].
 
     The power is that of `rfft2` with norm "ortho", in which white noise of variance s² has s². The sampling's error is
     the difference from waves sampled twice as finely, taken in the probed views; the others have their neighbour's.
-    Errors: `InputError` where frames do not fit the exposures, or predicted ones are not finite.
+    missing: pixels [V, h, w] bool without a value; the others stand for them. Errors: `InputError` where
+    frames do not fit the exposures, or predicted ones are not finite.
     """
     views, count = said.exposures.views, len(said.exposures)
     wanted = (count, *views.shape)
@@ -202,7 +210,11 @@ def residuals(said: Prediction, measured: Tensor, noise: Tensor, allowance: Allo
             if i in probed:
                 changes.append(_changes(one))
                 sampling.append(_power(said.view(i, 2).frames().double().cpu() - predicted))
-        spectra.append(_transform(measured[i : i + 1].double().cpu() - predicted))
+        left = measured[i : i + 1].double().cpu() - predicted
+        if missing is not None:
+            without = missing[i : i + 1]
+            left = left.masked_fill(without, 0.0) / math.sqrt(max(1 - float(without.float().mean()), 1 / left.numel()))
+        spectra.append(_transform(left))
     spectrum, nearest = torch.cat(spectra), np.abs(np.arange(count)[:, None] - probed).argmin(axis=1)
     contrast, known = rings.mean(_power(measured.double().cpu() - 1)), rings.mean(noise.double().cpu())
     sampled = rings.mean(torch.cat(sampling))[nearest]

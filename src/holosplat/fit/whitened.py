@@ -111,6 +111,7 @@ class WhitenedFrames:
         self._amplitudes = frames.clamp_min(0).sqrt().to(on)
         self.absorbed: Tensor | None = None
         """Line integrals [V, H, W] of β beside that of the material, in (the smallest) pixels; None for none."""
+        self._missing = None if train.gaps is None else train.gaps.to(on)
         self._light = None if light is None else light.factor().detach().to(on)
         power = noise.power()
         error = model_error(frames, power)
@@ -178,7 +179,7 @@ class WhitenedFrames:
     def __call__(self, lines: Tensor) -> Misfit:
         """Misfit of line integrals [V, H, W] and its gradient."""
         at = lines.detach().requires_grad_()
-        difference = self.amplitudes(at) - self._amplitudes
+        difference = self.known(self.amplitudes(at) - self._amplitudes)
         weighted = self.whitened(difference.detach())
         (gradient,) = torch.autograd.grad((difference * weighted).sum(), at)
         return Misfit(0.5 * float((difference.detach().double() * weighted).sum()), gradient)
@@ -200,7 +201,11 @@ class WhitenedFrames:
     def slopes(self, lines: Tensor, changes: list[Tensor], now: Tensor) -> list[Tensor]:
         """Derivatives [V, H, W] of the amplitudes `now` of line integrals [V, H, W] along each of `changes`."""
         with torch.no_grad():
-            return [(self.amplitudes(lines + LITTLE * change) - now) / LITTLE for change in changes]
+            return [self.known(self.amplitudes(lines + LITTLE * change) - now) / LITTLE for change in changes]
+
+    def known(self, differences: Tensor) -> Tensor:
+        """Differences [V, H, W] of amplitudes, 0 in the scan's missing pixels."""
+        return differences if self._missing is None else differences.masked_fill(self._missing, 0.0)
 
     def normal_equations(self, lines: Tensor, changes: list[Tensor]) -> tuple[Tensor, Tensor]:
         """`Jᵀ P⁻¹ J` [K, K] and `-gradient` [K], float64, along K changes [V, H, W] of the line integrals."""
@@ -208,7 +213,7 @@ class WhitenedFrames:
             now = self.amplitudes(lines)
         slopes = self.slopes(lines, changes, now)
         weighted = [self.whitened(slope).double().flatten() for slope in slopes]
-        missing = (self._amplitudes - now).double().flatten()
+        missing = self.known(self._amplitudes - now).double().flatten()
         matrix = torch.stack([torch.stack([s.double().flatten() @ w for w in weighted]) for s in slopes])
         return 0.5 * (matrix + matrix.T), torch.stack([w @ missing for w in weighted])
 

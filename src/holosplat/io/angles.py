@@ -194,11 +194,23 @@ def tell_views(scan: Scan) -> None:
             f"the angles of {len(views)} frames span {wide:.4g} degrees only; if they are radians, say so in their "
             "unit, or in the first line of the file of --angles"
         )
-    width, shifts = views.shape[1], views.shifts[:, 0] / views.pixel_sizes
-    off = float(shifts[0])
-    if wide > 180 and np.allclose(shifts, off, atol=1e-3) and abs(off) > OFF_CENTRE * width:
+    if is_half_acquisition(scan):
+        width, off = views.shape[1], float(views.shifts[0, 0]) / views.pixel_size
         warn(
             f"the axis is at column {0.5 * (width - 1) - off:.4g} of {width}, far from the middle: a turn sweeps "
             f"{width + 2 * abs(off):.0f} pixels, but the volume is as wide as a frame, and matter beyond it is cut "
-            "off; stitch opposite frames to wider ones first"
+            "off; frames are joined to wider ones only where each has an opposite one"
         )
+
+
+def is_half_acquisition(scan: Scan) -> bool:
+    """Whether views turn by more than 180° about an axis far from the middle of their frames, which stays where it
+    is."""
+    views, angles = scan.views, angles_of(scan.views)
+    one = scan.exposures.has_one_energy and len(np.unique(scan.exposures.distance)) == 1
+    if angles is None or len(views) < 2 or not one or not views.has_one_pixel or scan.is_series:
+        return False
+    sides, shifts = np.sort(angles % 360), views.shifts / views.pixel_size
+    wide = 360 - float(np.diff([*sides, sides[0] + 360]).max())
+    alike = np.allclose(shifts, shifts[:1], atol=1e-3)
+    return bool(wide > 180 and alike and abs(shifts[0, 0]) > OFF_CENTRE * views.shape[1])

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ..checks import InputError, require
+from ..frames import Frames
 from ..scan import Scan
 from . import arrays, euxfel, exchange, images, nerf_synthetic, nxtomo, r2_gaussian, run_scan, tiff
 from .kept_frames import with_fields
@@ -60,17 +61,27 @@ def read(path: str | Path, given: Mapping[str, Any] | None = None) -> Scan:
     return _loader_for(path, given).read(Path(path), given)
 
 
-def read_as(path: str | Path, reading: Reading) -> Scan:
-    """The scan at `path`, as `read`, with what is said of it beside its files, and cut to the part that is taken."""
-    reading.told.vouch(Path(path))
-    return reading.applied(read(path, reading.told.given(loader_of(path).takes)))
+def read_as(path: str | Path, reading: Reading, joined: bool = True) -> Scan:
+    """The scan at `path`, as `read`, with what is said of it beside its files, and cut to the part that is taken.
+
+    joined: as of `Reading.applied`.
+    """
+    return _read(path, reading, False, joined)
 
 
-def read_frames(path: str | Path, reading: Reading) -> Scan:
+def read_frames(path: str | Path, reading: Reading, joined: bool = True) -> Scan:
     """The scan at `path`, as `read_as`, for those who take the logarithm of its frames or compare with them: pixels
-    that are not above 0 are filled from their neighbours, and their number is said."""
-    scan = read_as(path, reading)
-    return Scan.of(Mended(scan.source), scan.exposures, scan.is_test, scan.provenance, scan.light)
+    that are not above 0 are missing, and their number is said."""
+    return _read(path, reading, True, joined)
+
+
+def _read(path: str | Path, reading: Reading, mended: bool, joined: bool) -> Scan:
+    reading.told.vouch(Path(path))
+    scan = read(path, reading.told.given(loader_of(path).takes))
+    if mended:
+        source = Mended(scan.source, None if isinstance(scan.source, Frames) else scan.missing)
+        scan = Scan.of(source, scan.exposures, scan.is_test, scan.provenance, scan.light)
+    return reading.applied(scan, joined)
 
 
 @contextmanager

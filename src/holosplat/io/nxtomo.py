@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import h5py
 import numpy as np
@@ -39,6 +39,14 @@ class RawLayout:
     flips: tuple[bool, bool] = (False, False)
 
 
+class Add(Protocol):
+    """Takes the next frame of a file."""
+
+    def __call__(self, frame: np.ndarray, missing: np.ndarray | None = None, /) -> None:
+        """frame: [H, W]; missing: [H, W] bool, pixels without a value."""
+        ...
+
+
 def read_scan(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Scan:
     """The projections of an NXtomo file, flat-field corrected, and how they were taken.
 
@@ -51,6 +59,8 @@ def read_scan(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Scan:
 
 def write_scan(path: str | Path, scan: Scan) -> None:
     """Write a scan as NXtomo (docs/scan_files.md); `path` is replaced only once all is written.
+
+    Missing pixels are written as NaN.
 
     Errors: `InputError` where `path` cannot be written.
 
@@ -66,9 +76,9 @@ def write_scan(path: str | Path, scan: Scan) -> None:
         Scan(4 frames of 16 × 20 pixels, 0 of them held out)
     """
     with scan_writer(path, scan.exposures, scan.is_test, scan.provenance, light=scan.light) as add:
-        for block in scan.blocks():
-            for frame in block:
-                add(frame)
+        for frames, missing in scan.blocks_with_missing():
+            for i, frame in enumerate(frames):
+                add(frame, None if missing is None else missing[i])
 
 
 @contextmanager
@@ -79,10 +89,14 @@ def scan_writer(
     provenance: dict[str, str],
     raw: RawLayout | None = None,
     light: DividedLight | None = None,
-) -> Iterator[Callable[[np.ndarray], None]]:
-    """A scan file that grows frame by frame: yields a function that takes the next frame, [H, W] relative intensity.
+    *,
+    mask: np.ndarray | None = None,
+) -> Iterator[Add]:
+    """A scan file that grows frame by frame: yields a function that takes the next frame, [H, W] relative intensity,
+    and its missing pixels [H, W] bool or None, which become NaN.
 
-    With `raw` the file holds counts (uint16), and exposures and is_test describe all its frames. light: what is not
+    With `raw` the file holds counts (uint16), and exposures and is_test describe all its frames. mask: [H, W] bool,
+    pixels that are missing in all frames, whose values were filled. light: what is not
     known of light that the frames were divided by, if they were.
 
     The file appears at `path` when the block ends and all frames are there, and not at all when the block raises
@@ -99,13 +113,16 @@ def scan_writer(
     size = len(exposures) * math.prod(exposures.views.shape) * (2 if raw else 4)
     with new_hdf5(path, size) as file:
         data = _write_entry(file, exposures, is_test, provenance, raw)
+        if mask is not None:
+            put(file, f"entry/{MASK}", mask.astype(np.uint32))
         if light is not None:
             write_divided_light(_group(file, LIGHT, "NXcollection"), light)
 
-        def add(frame: np.ndarray) -> None:
+        def add(frame: np.ndarray, missing: np.ndarray | None = None) -> None:
             nonlocal count
             require(count < len(data), f"a scan of {len(data)} exposures takes as many frames, but there are more.")
-            data[count] = finite("frames", shaped("frame", np.asarray(frame), exposures.views.shape))
+            checked = finite("frames", shaped("frame", np.asarray(frame), exposures.views.shape))
+            data[count] = checked if missing is None else np.where(missing, np.nan, checked)
             count += 1
 
         yield add

@@ -14,6 +14,7 @@ from ..checks import InputError, require
 from ..ranges import Frequency, Natural, Signed, Small, ranged
 from ..tables import LARGEST, from_table, number_in, shown, to_table
 from .angles import read_angles, tell_angles, tell_views
+from .half_acquisition import stitched
 from .tube import Tube
 
 if TYPE_CHECKING:
@@ -188,9 +189,13 @@ class Reading:
     told: Told = field(default_factory=Told)
     part: Part = field(default_factory=Part)
 
-    def applied(self, scan: Scan) -> Scan:
-        """A scan that a loader has read, with its axis and sense of rotation, and cut to the part that is taken."""
+    def applied(self, scan: Scan, joined: bool = True) -> Scan:
+        """A scan that a loader has read, with its axis and sense of rotation, and cut to the part that is taken.
+
+        joined: whether opposite frames of a half acquisition become wider ones (`stitched`).
+        """
         scan = self.told.placed(scan)
+        scan = stitched(scan) if joined else scan
         tell_views(scan)
         return self.part.of(scan if self.told.tube is None else Tube.parsed(self.told.tube).taken_out_of(scan))
 

@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 
 from ..checks import InputError, note, require, warn
-from ..frames import Frames
+from ..frames import Derived, Frames, Taken
 from ..preprocess.flat_field import relative_intensity, unlit
 from ..preprocess.pixels import MOST_DEFECTS, PixelRepair
 from ..scan import Scan
@@ -21,7 +21,7 @@ from .kept_frames import with_fields
 from .raw_file import DARK, FLAT, PROJECTION, Opens, ScanFile, Stack, rows_of
 from .stacks import ImageStack
 
-FILLED = "are filled from their neighbours, and count as measured"
+FILLED = "are filled from their neighbours, and have no weight"
 """What is said of pixels that have no value of their own."""
 
 
@@ -39,14 +39,14 @@ class _Place:
 
 
 @dataclass(frozen=True)
-class StoredFrames(Frames):
+class StoredFrames(Derived):
     """The projections of a file, flat-field corrected when they are read.
 
     stacks: of the file; a dataset of HDF5 by its place.
     numbers: [N] of the projections among the file's frames.
     dark, light: [H, W] mean dark field and mean flat field less that, light None where the file is corrected already.
-    mask: [H, W] bool of the pixels that are marked as defective. These, and values that are not finite, are filled from
-    their neighbours, and their number is said.
+    mask: [H, W] bool of the pixels that are marked as defective. These, and values that are not finite, are missing:
+    they are filled from their neighbours, and their number is said.
     held: the file that holds each projection, and its stamp when it was opened.
 
     The file is opened anew for each reading. Errors: `InputError` for a file that is gone or changed, or of which more
@@ -83,8 +83,8 @@ class StoredFrames(Frames):
         held = tuple((places[n], _stamp(places[n])) for n in numbers)
         return cls(path, file.label, stacks, file.flips, numbers, dark, light, mask, whole, held)
 
-    def read(self, numbers: np.ndarray) -> np.ndarray:
-        """See `Frames.read`."""
+    def with_missing(self, numbers: np.ndarray) -> Taken:
+        """See `Frames.with_missing`."""
         for place, stamp in {self.held[n] for n in numbers}:
             gone = f"{place} must be the file that was opened, but it is gone; put it back, or open another."
             require(place.exists(), gone)
@@ -100,7 +100,7 @@ class StoredFrames(Frames):
             for i, n in enumerate(self.numbers[numbers]):  # one by one: raw frames are wider, and there may be many
                 raw = rows_of(stacks, int(n), slice(0, self.shape[1]), self.flips)
                 frames[i] = raw if self.light is None else relative_intensity(raw, self.dark, self.light)
-        return filled(self.label, frames, ~np.isfinite(frames), self.mask, self.numbers[numbers])
+        return filled(self.label, frames, ~np.isfinite(frames) & ~self.mask, self.mask, self.numbers[numbers])
 
 
 def _places_of(stack: Stack, path: Path) -> list[Path]:
@@ -110,13 +110,13 @@ def _places_of(stack: Stack, path: Path) -> list[Path]:
     return [path] * stack.shape[0]
 
 
-def filled(label: str, frames: np.ndarray, bad: np.ndarray, mask: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-    """Frames [K, H, W] whose `bad` pixels [K, H, W], and those of the `mask` [H, W], are filled from their neighbours.
+def filled(label: str, frames: np.ndarray, found: np.ndarray, mask: np.ndarray, numbers: np.ndarray) -> Taken:
+    """Frames [K, H, W] whose pixels `found` [K, H, W], and those of the `mask` [H, W] or [K, H, W], are filled from
+    their neighbours, and which pixels these are.
 
-    The number of bad ones is said; numbers: [K] of the frames. Errors: `InputError` for a frame with more than a part
-    `MOST_DEFECTS` of them.
+    The number of those found is said; numbers: [K] of the frames. Errors: `InputError` for a frame with more than a
+    part `MOST_DEFECTS` of them.
     """
-    found = bad & ~mask
     if found.any():
         shares, count = found.mean(axis=(1, 2)), int(found.any(axis=(1, 2)).sum())
         worst = int(np.argmax(shares))
@@ -127,26 +127,32 @@ def filled(label: str, frames: np.ndarray, bad: np.ndarray, mask: np.ndarray, nu
         )
         which = f"{int(found.sum())} pixels in {count} of {len(frames)} frames"
         warn(f"{label}: {which} are not above 0, or no numbers; they {FILLED}")
-    whole = PixelRepair(mask)
-    for i, each in enumerate(found):
-        if each.any() or mask.any():
-            frames[i] = (PixelRepair(each | mask) if each.any() else whole)(frames[i])
-    return frames
+    missing = found | mask
+    if not missing.any():
+        return frames, None
+    repair = PixelRepair(missing[0])
+    for i, each in enumerate(missing):
+        if each.any():
+            repair = repair if np.array_equal(repair.mask, each) else PixelRepair(each)
+            frames[i] = repair(frames[i])
+    return frames, missing
 
 
-class Mended(Frames):
-    """Frames whose pixels that are not above 0, which no light can be, are filled from their neighbours."""
+class Mended(Derived):
+    """Frames whose pixels that are not above 0, which no light can be, are missing, too."""
 
-    def __init__(self, frames: np.ndarray | Frames) -> None:
-        self._frames = frames
+    def __init__(self, frames: np.ndarray | Frames, missing: np.ndarray | None = None) -> None:
+        self._frames, self._missing = frames, missing
         self.shape = (frames.shape[0], frames.shape[1], frames.shape[2])
 
-    def read(self, numbers: np.ndarray) -> np.ndarray:
-        """See `Frames.read`."""
-        frames = np.array(self._frames[numbers])
-        return filled(
-            "the scan", frames, frames <= 0, np.zeros(self.shape[1:], dtype=bool), np.arange(self.shape[0])[numbers]
-        )
+    def with_missing(self, numbers: np.ndarray) -> Taken:
+        """See `Frames.with_missing`."""
+        if isinstance(self._frames, Frames):
+            frames, before = self._frames.with_missing(numbers)
+        else:
+            frames, before = np.array(self._frames[numbers]), None if self._missing is None else self._missing[numbers]
+        before = np.zeros(frames.shape, dtype=bool) if before is None else before
+        return filled("the scan", frames, (frames <= 0) & ~before, before, np.arange(self.shape[0])[numbers])
 
 
 def reader(opens: Opens) -> Callable[[Path, Mapping[str, Any]], Scan]:

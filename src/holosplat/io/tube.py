@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..checks import require
-from ..frames import divided
 from ..ranges import ranged
 from ..tables import number_in, shown
 
@@ -60,6 +59,5 @@ class Tube:
 
     def taken_out_of(self, scan: Scan) -> Scan:
         """The scan as if without the tube, whose light is divided out of every frame."""
-        frames = divided(scan.source, self.transmission(scan.views)[:, None, :].astype(np.float32))
         said = {"tube": f"{self.inner:g} m to {self.outer:g} m, {self.attenuation:g} per metre, divided out"}
-        return scan.of(frames, scan.exposures, scan.is_test, scan.provenance | said)
+        return scan.divided(self.transmission(scan.views)[:, None, :].astype(np.float32), said)

@@ -12,7 +12,7 @@ import torch
 from ..checks import InputError
 from ..inference import Decision, Score, select
 from ..matter import MaterialPrior
-from .first_volumes import FirstVolumes, score_of
+from .first_volumes import FirstVolumes
 
 STAGE = "sign of the contrast"
 ABOVE, BELOW = "δ above the medium's", "δ below the medium's"
@@ -39,8 +39,8 @@ def decide_sign(first: FirstVolumes, *scores: Scoring) -> tuple[FirstVolumes, tu
             try:
                 return score(volumes[name], fold)
             except InputError:  # there is no such matter, or no such light
-                unseen = torch.from_numpy(first.folds.split(fold)[1].frames)
-                return score_of(unseen, torch.ones_like(unseen))
+                unseen = first.folds.split(fold)[1]
+                return Score.of(unseen.left(torch.ones(unseen.frames.shape, dtype=torch.float64)))
 
         return select(STAGE, (ABOVE, BELOW), scored, first.folds.count, by=first.folds.by)
 

@@ -75,14 +75,14 @@ class MissingMatter:
 
     def shares(self, obj: Object, oversample: int = 0) -> tuple[float, float]:
         """The same of matter, and of the contrast of the frames. oversample: as for `predicted`."""
-        matter, contrast = self.squares(self.measured - self.predicted(obj, oversample))
+        matter, contrast = self.squares(self.scan.left(self.predicted(obj, oversample)))
         return math.sqrt(matter), math.sqrt(contrast)
 
     def beyond_noise(self, predicted: Tensor, noise: NoiseModel) -> float:
         """Root of the part of all matter that predicted frames [V, H, W] leave unexplained beyond `noise`; 0 where
         that may hide all of it, by `HIDDEN` standard deviations."""
         draws = torch.tensor([self.of(noise.drawn(seed)) for seed in range(DRAWS)], dtype=torch.float64)
-        left = (self.of(self.measured - predicted) - float(draws.mean())) / max(self.whole, np.finfo(float).tiny)
+        left = (self.of(self.scan.left(predicted)) - float(draws.mean())) / max(self.whole, np.finfo(float).tiny)
         deviation = float(draws.std(correction=0)) / max(self.whole, np.finfo(float).tiny)
         return math.sqrt(left) if left > HIDDEN * deviation else 0.0
 

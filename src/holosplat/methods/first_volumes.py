@@ -17,7 +17,6 @@ from torch import Tensor
 from ..backends import resolve
 from ..baselines import HolographicTV, holographic_tv
 from ..baselines.holographic_tv import retrieved
-from ..inference import Score
 from ..matter import DeltaBeta, MaterialPrior, Matter
 from ..optics.background import Background, Light
 from ..optics.noise import noise_levels
@@ -147,11 +146,6 @@ def lit_by_halves(measured: Tensor, predicted: Tensor, known: Background) -> Ten
         factor = shared.seen_beside(measured, predicted, part).factor()
         lit[:, ~part] *= factor[:, ~part]
     return lit
-
-
-def score_of(measured: Tensor, predicted: Tensor) -> Score:
-    """Of the residual of unseen frames [V, H, W]."""
-    return Score.of(measured.double() - predicted.double())
 
 
 def predictions(found: Object, scan: Scan) -> Tensor:

@@ -82,7 +82,7 @@ class Keeper:
         if self._judge is None:
             self._judge = MissingMatter(self.train, _material(self.best.object if self.best else found))
         state = State.of(name, found, oversample, self.train.exposures)
-        self.judged[name] = math.sqrt(self._judge.squares(self._judge.measured - state.predicted)[0])
+        self.judged[name] = math.sqrt(self._judge.squares(self.train.left(state.predicted))[0])
         if self._wins(state, fitted):
             self.best = state
 
@@ -90,8 +90,8 @@ class Keeper:
         best = self.best
         if best is None:
             return True
-        same, measured = best.object.kind == latest.object.kind, torch.from_numpy(self.train.frames)
-        earlier, later = (Score.of(measured - each.predicted) for each in (best, latest))
+        same = best.object.kind == latest.object.kind
+        earlier, later = (Score.of(self.train.left(each.predicted)) for each in (best, latest))
         compared = Compared(best.name, *earlier.gain_over(later))
         if not (fitted and (self.mixed or same)):
             return not (same and compared.wins and _lost(latest.predicted, best.predicted))

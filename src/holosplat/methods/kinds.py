@@ -14,9 +14,9 @@ from ..inference import Decision, Score, select
 from ..representations import Stored
 from ..scan import Scan
 from .cross_validation import predicted_frames
-from .first_volumes import EFFORT, Folds, score_of
+from .first_volumes import EFFORT, Folds
 from .keeper import NAME, Unseen
-from .method import Method, Task, run_stages
+from .method import Method, Task, run_stages, unheard
 
 STAGE = "kinds of results"
 
@@ -54,11 +54,10 @@ def decide_kind(task: Task, method: Method, null: str, other: str) -> Decision:
         seen, unseen = folds.split(fold)
         lit = task.lit and task.lit.part(torch.from_numpy(folds.kept(fold)), folds.binning)
         last = _LastOfEachKind()
-        run_stages(method.with_effort(EFFORT), replace(task, scan=seen, lit=lit, first=None, near=False), last)
-        measured = torch.from_numpy(unseen.frames)
-        return {
-            kind: score_of(measured, predicted_frames(unseen.exposures, *state)) for kind, state in last.states.items()
-        }
+        part = replace(task, scan=seen, lit=lit, first=None, near=False, on_start=unheard)
+        run_stages(method.with_effort(EFFORT), part, last)
+        expected = {kind: predicted_frames(unseen.exposures, *state) for kind, state in last.states.items()}
+        return {kind: Score.of(unseen.left(frames.double())) for kind, frames in expected.items()}
 
     def score(kind: str, fold: int) -> Score:
         found = scores(fold)

@@ -11,15 +11,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from torch import from_numpy
-
 from ..checks import InputError
 from ..inference import Decision, Score, select
 from ..learning.start import GuessedMatter, guess_matter
 from ..representations import GaussianCloud, SurfaceMesh
 from .coarse import Way, first_of
 from .cross_validation import predicted_frames
-from .first_volumes import BY_FISSION, Folds, score_of
+from .first_volumes import BY_FISSION, Folds
 from .gaussian_options import GaussianOptions
 from .method import Task, run_quietly
 from .posed import red_cells
@@ -137,7 +135,7 @@ class _Fits:
             start = self.fitted(task, start, how.trial_steps)
             found = _surfaces(task, start, how.trial_surfaces) if task.bounded else None
         samples = 0 if found is None else oversampling(seen)
-        return score_of(from_numpy(unseen.frames), predicted_frames(unseen.exposures, found or start, samples))
+        return Score.of(unseen.left(predicted_frames(unseen.exposures, found or start, samples).double()))
 
 
 def _surfaces(task: Task, cloud: GaussianCloud, steps: int) -> SurfaceMesh | None:

@@ -6,8 +6,6 @@ from contextlib import suppress
 from dataclasses import replace
 from itertools import combinations
 
-import torch
-
 from ..backends import resolve
 from ..checks import InputError, require
 from ..inference import Score, select
@@ -15,7 +13,6 @@ from ..matter import Matter
 from ..representations import SurfaceMesh, VoxelGrid
 from .coarse import settled
 from .cross_validation import predicted_frames
-from .first_volumes import score_of
 from .gaussian_options import GaussianOptions
 from .keeper import BY
 from .method import Task
@@ -46,7 +43,7 @@ def surfaces_of_levels(task: Task, options: GaussianOptions, surfaces: SurfaceOp
     def scored(name: str, fold: int) -> Score:
         there = found[name].on(resolve(surfaces.fit.backend))
         predicted = predicted_frames(task.scan.exposures, there, oversampling(task.scan, surfaces.fit))
-        return score_of(torch.from_numpy(task.scan.frames), predicted)
+        return Score.of(task.scan.left(predicted.double()))
 
     decision = select(NAME, tuple(found), scored, by=BY)
     task.on_start(decision, None)

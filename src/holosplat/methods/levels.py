@@ -24,6 +24,7 @@ from ..representations import VoxelGrid
 from .first_volumes import BY_FISSION, FirstVolumes, predictions
 from .method import Method, Task, solve_stages
 from .trials import FREE, Trial, Trials, accepted, first_of_task, name_of, named
+from .uncertain import Determined, likeliest_ratio
 
 STAGE = "levels or continuous matter"
 NAME = "matter"
@@ -61,7 +62,7 @@ def decide_matter(task: Task, methods: Mapping[MatterKind, Method] | None = None
     def scored(name: str, fold: int) -> Score:
         return fits.score(name_of(first.taken), kind_of(name), fold, two=name == LEVELS[1])
 
-    return select(NAME, candidates, scored, by=f"{first.folds.by}, by fits")
+    return select(NAME, candidates, scored, first.folds.count, by=f"{first.folds.by}, by fits")
 
 
 class _FlatVolumes:
@@ -100,7 +101,8 @@ class _FlatVolumes:
 class TrialFits:
     """Fits of the methods for either kind of matter to coarse frames, under hypotheses about light and noise.
 
-    Two levels alone need no ratio δ/β; else it is, where nothing is known, that of the first volume.
+    Two levels alone need no ratio δ/β; else it is, where nothing is known, the likeliest one, as in a run; before light
+    is decided, that of the first volume.
     """
 
     def __init__(self, task: Task, first: FirstVolumes, methods: Mapping[MatterKind, Method]) -> None:
@@ -123,9 +125,16 @@ class TrialFits:
         seen = replace(trial.seen, frames=trial.light.evened(torch.from_numpy(trial.seen.frames)).numpy())
         prior = task.prior
         if not (prior.fixes_ratio or two):
-            prior = MaterialPrior.of_ratio(self._first.material.ratio, prior.sign)
+            known = task.lit is not None
+            ratio = ratio_of_one(task, self._first).value if known else self._first.material.ratio
+            prior = MaterialPrior.of_ratio(ratio, prior.sign)
         fitted = replace(task, scan=seen, prior=prior, lit=trial.light, matter=kind, first=None)
         return predictions(solve_stages(method, fitted), trial.unseen)
+
+
+def ratio_of_one(task: Task, first: FirstVolumes) -> Determined:
+    """δ/β where nothing is known and all matter has one: `likeliest_ratio`, found once for a task."""
+    return first.once("likeliest ratio", 0, lambda: likeliest_ratio(task))
 
 
 def kind_of(choice: str) -> MatterKind:

@@ -159,7 +159,7 @@ class Ranges:
         """What amplitudes `now` leave of the measured ones."""
         if self._predicted is not None:
             self._offset, self._predicted = self._predicted.clamp_min(0).sqrt().to(now) - now, None
-        return self.frames.measured - now - self._offset
+        return self.frames.known(self.frames.measured - now - self._offset)
 
 
 def best(found: list[Told]) -> Told:

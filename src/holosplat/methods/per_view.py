@@ -60,13 +60,15 @@ class PerViewStage:
         material = assumed_material(scan, task.prior, task.on_progress)
         retrieve = RETRIEVALS[how.retrieval]
         frames = torch.from_numpy(scan.frames)
-        thickness = retrieve(frames, scan.exposures, *material, on_progress=task.report("phase retrieval"))
+        report = task.report("phase retrieval")
+        thickness = retrieve(frames, scan.exposures, *material, missing=scan.gaps, on_progress=report)
         grid, report = Grid.of_views(scan.views), task.report(self.name)
         if how.tomography == SVMBIR:
-            values = svmbir_volume(thickness, scan.views, grid, report)
+            values = svmbir_volume(thickness, scan.views, grid, report, missing=scan.gaps)
         else:
             upper = (task.bound(1.0) or None) if how.bounded else None
-            values = TOMOGRAPHIES[how.tomography](thickness, scan.views, grid, upper, report)
+            tomography = TOMOGRAPHIES[how.tomography]
+            values = tomography(thickness, scan.views, grid, upper, report, missing=scan.gaps)
         return VoxelGrid(values[None], grid, Matter.one(*material))
 
     def fit(self, task: Task, start: Stored) -> None:

@@ -17,9 +17,10 @@ from .auto import Auto
 from .gaussians import Gaussians
 from .illumination import prepared
 from .kinds import unseen_kinds
-from .levels import LEVELS, NAME, decide_matter, kind_of
+from .levels import LEVELS, NAME, decide_matter, kind_of, ratio_of_one
 from .method import Method, Task, solve_stages
-from .uncertain import Determined, Uncertain, determine, likeliest_ratio, placed, told
+from .trials import first_of_task
+from .uncertain import Determined, Uncertain, determine, placed, told
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,7 @@ def settled(
         one = one or (decision.choice == LEVELS[0] and len(decision.compared) > 0)
         method = method.suited(kind)
     if one and not task.prior.fixes_ratio:
-        constants = (*constants, likeliest_ratio(task))
+        constants = (*constants, ratio_of_one(task, first_of_task(task)))
     return Settled(method, kind, decision, constants)
 
 

@@ -8,8 +8,6 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import ClassVar
 
-import torch
-
 from ..backends import Backend, resolve
 from ..checks import InputError, require
 from ..fit.loop import Fit
@@ -21,7 +19,6 @@ from ..scan import Scan
 from .coarse import CoarseToFine, Way, begun_surfaces, coarse_surfaces, missing_matter, on_pixels, settled
 from .cross_validation import predicted_frames
 from .first_surfaces import first_surfaces, is_noisy, surfaces_of_volume
-from .first_volumes import score_of
 from .gaussians import Gaussians, GaussianStage
 from .keeper import BY
 from .method import Method, Near, Stage, Task, quiet, run_quietly
@@ -121,7 +118,7 @@ class BodiesStage(GaussianStage):
     def _score(self, found: SurfaceMesh, task: Task) -> Score:
         there = found.on(resolve(self.surfaces.fit.backend))
         predicted = predicted_frames(task.scan.exposures, there, oversampling(task.scan, self.surfaces.fit))
-        return score_of(torch.from_numpy(task.scan.frames), predicted)
+        return Score.of(task.scan.left(predicted.double()))
 
     def _missing(self, found: SurfaceMesh | GaussianCloud, task: Task) -> float:
         return missing_matter(found, task, self.surfaces)

@@ -44,6 +44,7 @@ def svmbir_volume(
     on_progress: Advance,
     *,
     options: Mbir = Mbir(),
+    missing: Tensor | None = None,
 ) -> Tensor:
     """Occupancy [Z, Y, X] ≥ 0 on `grid` from thickness `lines` [V, H, W] in metres; float32.
 
@@ -73,6 +74,7 @@ def svmbir_volume(
             stop_threshold=0.0,
             num_threads=options.threads,
             svmbir_lib_path=cache,
+            weights=None if missing is None else (~missing).double().numpy(),
             verbose=0,
         )
     return torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))

@@ -16,7 +16,7 @@ from ..optics.noise_model import NoiseModel
 from ..optics.patterns import fixed_pattern
 from ..representations import VoxelGrid
 from ..scan import Scan
-from .first_volumes import FirstVolumes, Folds, lit_by_halves, predictions, score_of
+from .first_volumes import FirstVolumes, Folds, lit_by_halves, predictions
 from .method import Task
 
 NULL = "as measured"
@@ -74,7 +74,7 @@ class Trial:
         measured = self.measured if light.still is None else (self.measured / light.still).to(self.measured.dtype)
         known = light.background
         lit = self.expected.double() if known is None else lit_by_halves(measured, self.expected, known)
-        return score_of(self.measured, lit if light.still is None else lit * light.still)
+        return Score.of(self.unseen.left(lit if light.still is None else lit * light.still))
 
 
 class Trials:

@@ -82,4 +82,4 @@ def _left(task: Task, found: SurfaceMesh, surfaces: SurfaceOptions) -> float:
     """Mean square of what `found` leaves of the frames."""
     there = found.on(resolve(surfaces.fit.backend))
     predicted = predicted_frames(task.scan.exposures, there, oversampling(task.scan, surfaces.fit))
-    return float((torch.from_numpy(task.scan.frames) - predicted.cpu()).double().square().mean())
+    return float(task.scan.left(predicted.cpu()).double().square().mean())

@@ -48,7 +48,9 @@ class Windows:
         (h, w), views = self.shape, scan.views
         middles = np.stack([self.lefts + 0.5 * (w - views.shape[1]), self.tops + 0.5 * (h - views.shape[0])], axis=1)
         moved = replace(views, shape=self.shape, shifts=views.shifts + middles * views.pixel_sizes[:, None])
-        return replace(scan, frames=self.cut(scan.frames), exposures=replace(scan.exposures, views=moved))
+        missing = None if scan.missing is None else self.cut(scan.missing)
+        exposures = replace(scan.exposures, views=moved)
+        return replace(scan, frames=self.cut(scan.frames), exposures=exposures, missing=missing)
 
     def cut(self, images: np.ndarray) -> np.ndarray:
         """These parts of images [V, H, W]."""

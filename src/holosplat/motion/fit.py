@@ -28,7 +28,6 @@ from ..representations.isosurface import adjacency
 from ..scan import Scan
 from .elastic import Rest, RestShapeKept
 from .terms import COEFFICIENTS, Acceleration, Apart, MovingBending, area_kept, volume_kept
-from .velocity_prior import Carried
 
 OPEN = 1e-3
 """Share of the times' mean square below which a coefficient is taken to be seen so well: what frames hardly see of a
@@ -60,9 +59,6 @@ class MotionFit:
     """The same of its area: red cells in flow change theirs by 1 to 5 % (0: areas are free)."""
     apart: Weight = 0.2
     """How deep bodies may lie in each other, a standard deviation [pixels] (0: unconstrained)."""
-    carrier: Weight = 0.0
-    """Weight of a velocity field that bodies share, whose scatter their velocities tell (1: as probabilities have it;
-    0: none). Off, for frames that see bodies tell their velocities better than any field."""
     objective: Objective = field(default_factory=_objective)
     """How frames are compared, and what bending costs."""
     schedule: Schedule = field(default_factory=lambda: Schedule(steps=100, views_per_step=16))
@@ -132,8 +128,6 @@ def _terms(base: Ground, start: MovingSurfaces, options: MotionFit) -> list[Term
         found.append(
             Apart(_of_likelihood(base) * start.basis.count / 2 / options.apart**2, start, base.train.exposures.time)
         )
-    if options.carrier > 0 and start.count > 1 and moves:
-        found.append(Carried(_of_likelihood(base) * options.carrier, start))
     return found
 
 
@@ -151,8 +145,8 @@ def _of_likelihood(base: Ground) -> float:
     width, objective = base.frames.resolved.get("rounding", 0.0), base.frames.objective
     require(
         width > 0,
-        "volume_kept, area_kept, apart and carrier need frames that are compared by `rounded`; raise its "
-        "weight, or set all four to 0.",
+        "volume_kept, area_kept and apart need frames that are compared by `rounded`; raise its weight, or set all "
+        "three to 0.",
     )
     noise = width / objective.rounding
     return objective.rounded * noise**2 / width / base.train.frames.size

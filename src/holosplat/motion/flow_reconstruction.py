@@ -56,7 +56,7 @@ FEWEST_PIXELS = 24
 
 @dataclass(frozen=True)
 @ranged
-class CarriedOptions:
+class FlowOptions:
     """How matter in motion is reconstructed."""
 
     volume: SmoothVolume = field(default_factory=SmoothVolume)
@@ -99,7 +99,7 @@ class CarriedOptions:
 
 
 @dataclass(frozen=True)
-class Carried:
+class FlowResult:
     """The result. object: the matter in motion; volume: of the reference time, on voxels; misfit: [T] χ² a pixel at
     each time; history: what was tried, in words; timing: seconds by stage; decisions: on motion, and on the flow's
     freedom."""
@@ -122,14 +122,14 @@ class _State:
     fading: Fading | None = None
 
 
-class Search:
+class FlowSearch:
     """The way from frames to matter in motion, step by step; `journal` keeps the last of them."""
 
     def __init__(
         self,
         task: Task,
         material: DeltaBeta,
-        options: CarriedOptions = CarriedOptions(),
+        options: FlowOptions = FlowOptions(),
         journal: Journal = NOWHERE,
     ) -> None:
         self.task, self.options, self.journal = task, options, journal
@@ -261,7 +261,7 @@ class Search:
         found["decisions"] = [one.as_dict() for one in self.decisions]
         self.journal.save({"steps": self._step, **found})
 
-    def run(self) -> Carried:
+    def run(self) -> FlowResult:
         """The whole way, from the middle time on."""
         state = self._run_stage("flow", self._initial_state)
         windows = self.windows()
@@ -332,7 +332,7 @@ class Search:
         times = np.flatnonzero(left.any(1)).tolist()
         return self.problem(times, self.factor, state, left).residuals(state.u)
 
-    def finished(self, state: _State) -> Carried:
+    def finished(self, state: _State) -> FlowResult:
         """The state on voxels of a pixel, and the Gaussians that stand for it."""
         state = self._run_stage("volume", lambda: self._fit_fine_voxels(state))
         problem = self.problem(range(len(self.times)), 1, state)
@@ -341,7 +341,7 @@ class Search:
         volume = self._volume(state.u, 1)
         found = self.gaussians(volume, state)
         said = tuple(self.history), self.timing, tuple(self.decisions)
-        return Carried(found, volume, state.flow, misfit, *said)
+        return FlowResult(found, volume, state.flow, misfit, *said)
 
     def _volume(self, u: Tensor, factor: int) -> VoxelGrid:
         return VoxelGrid(u[None], self._grid(factor), Matter.one(*self.frames.material))

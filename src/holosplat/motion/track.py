@@ -2,18 +2,73 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
+
+import torch
 
 from ..bodies.rest_shape import KnownBody, guessed_cells
 from ..bodies.twin import two_beams
+from ..checks import InputError, as_written
+from ..inference import Score, select
 from ..matter import DeltaBeta
 from ..optics.background import Light
 from ..progress import FitProgress
 from ..scan import Scan
 from .body_tracker import BodyTracker, Followed, require_times
 from .journal import Journal, Nowhere
-from .model_comparison import Parts, compared_kinds
+from .residual_detection import predicted
 from .track_options import TrackOptions
+
+NAME, CELLS, ANY = "shape of the bodies", "red cells", "any shape"
+
+
+class NamedJournal:
+    """The journal of one of several runs, by its name."""
+
+    def __init__(self, journal: Journal, states: dict[str, Mapping[str, Any]], name: str) -> None:
+        """states: of all of them, which `journal` keeps together."""
+        self._journal, self._states, self._name = journal, states, name
+
+    def load(self) -> Mapping[str, Any] | None:
+        """Load the last saved state; None at the beginning."""
+        return self._states.get(self._name)
+
+    def save(self, state: Mapping[str, Any]) -> None:
+        """Keep it, beside those of the others."""
+        self._states[self._name] = state
+        self._journal.save(self._states)
+
+
+def compared_kinds(cells: BodyTracker, other: BodyTracker) -> Followed:
+    """What `cells`, of red cells, found, or `other`, of bodies of any shape, which has its sightings.
+
+    Errors: those of either; where there are no cells of that size, of `other` alone.
+    """
+    if cells.stage == "sightings":
+        cells.seen, cells.counts, cells.guess, cells.stage = other.seen, other.counts, other.guess, "first paths"
+        cells.decisions = list(other.decisions)
+    try:
+        cells.until("stiff")
+    except InputError:  # no cell of that size
+        other.until("done")
+        return other.followed("; no red cells of their size were found")
+    cells.until("halves")
+    other.until("halves")
+    scores = {CELLS: unexplained(cells), ANY: unexplained(other)}
+    decision = select(NAME, tuple(scores), lambda name, fold: scores[name], by="training frames")
+    kept = cells if decision.choice == CELLS else other
+    kept.decisions = [*(each for each in kept.decisions if each.name != NAME), decision]
+    kept.until("done")
+    return kept.followed()
+
+
+def unexplained(of: BodyTracker) -> Score:
+    """The residual of the training frames beside the frames of the bodies."""
+    assert of.bodies is not None
+    return Score.of(torch.from_numpy(of.train.frames - predicted(of.train, of.bodies, of.oversample)))
+
 
 __all__ = ["NOWHERE", "USUAL", "Followed", "TrackOptions", "follow", "require_times"]
 
@@ -39,15 +94,18 @@ def follow(
     light: of the training frames, which were divided by it, where it is uneven. journal: keeps every stage that is
     done, and fits from time to time; what it holds already is not done again, and the result is the same bit for bit.
     Where all frames are of two beams, of unknown shape, and a network of red cells guesses the bodies, they are
-    followed as red cells, too; these are kept unless bodies of any shape leave less (`model_comparison`). Errors:
+    followed as red cells, too; these are kept unless bodies of any shape leave less (`compared_kinds`). Errors:
     `InputError` for a scan of one time, and where no body is seen.
     """
     train = scan.train()
     require_times(train)
-    parts = Parts(journal)
+    with as_written("checkpoint.pt", "a checkpoint of this run"):
+        states = dict[str, Mapping[str, Any]](journal.load() or {})
 
     def following(name: str, body: KnownBody | None) -> BodyTracker:
-        run = BodyTracker(train, material, replace(options, body=body), seed, light, parts.of(name), on_progress)
+        run = BodyTracker(
+            train, material, replace(options, body=body), seed, light, NamedJournal(journal, states, name), on_progress
+        )
         run.take_up()
         return run
 

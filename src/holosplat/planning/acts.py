@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ..matter import MatterKind
     from ..methods import Method, Pinn
     from ..methods.surface_fit import SurfaceOptions
-    from ..motion.flow_reconstruction import CarriedOptions
+    from ..motion.flow_reconstruction import FlowOptions
     from ..motion.track_options import TrackOptions
     from ..scan import Exposures
 
@@ -130,7 +130,7 @@ def of_alignment(exposures: Exposures, how: PoseOptions) -> Needs:
     return Needs(memory, Costs.written * pixels + 1e6, 10 + 2e-5 * sizes.views * sizes.voxels)
 
 
-def of_motion(exposures: Exposures, how: CarriedOptions) -> Needs:
+def of_motion(exposures: Exposures, how: FlowOptions) -> Needs:
     """What `reconstruct --motion flow` takes where something moves: a volume that a flow carries to every time."""
     one, times = Sizes.of(one_time(exposures)), times_of(exposures)
     alone = of_fit(one, how.volume)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,11 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from ..io.atomic import atomic_path
+from ..io.atomic import write_rows
 from ..tables import number_in
-from .folder import SeriesFolder, TaskState, time_left
+from .folder import Body, Row, SeriesFolder, TaskState, plain, time_left
 from .plan import Moment, SeriesPlan
-from .rows import Body, Row, plain
 from .time import PHASE
 
 if TYPE_CHECKING:
@@ -140,17 +138,10 @@ def collect(folder: SeriesFolder) -> Collected:
     from .page import write_page  # which needs matplotlib
 
     found = collected(folder)
-    _write_csv(folder.table, COLUMNS, _lines(folder, found))
-    _write_csv(folder.bodies, BODY_COLUMNS, _body_lines(found))
+    write_rows(folder.table, COLUMNS, _lines(folder, found))
+    write_rows(folder.bodies, BODY_COLUMNS, _body_lines(found))
     write_page(folder.page, page_of(folder, found))
     return found
-
-
-def _write_csv(path: Path, head: Sequence[str], lines: Iterable[Sequence[object]]) -> None:
-    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(head)
-        writer.writerows(lines)
 
 
 def _lines(folder: SeriesFolder, found: Collected) -> Iterable[list[object]]:

@@ -26,7 +26,7 @@ from ..units import plain as in_digits
 from ..workflows.next_step import next_step
 from ..workflows.run_folder import RunFolder
 from ..workflows.verdict import Verdict
-from .rows import Row, plain, some
+from .folder import Row, plain, some
 
 MOST_PICTURES = 160
 """Times whose phase map a page holds, at most: evenly chosen, about 8 kB each."""

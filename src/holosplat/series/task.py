@@ -24,12 +24,11 @@ from ..workflows.evaluate import Evaluation, evaluate
 from ..workflows.reconstruction import Reconstruction
 from ..workflows.run_folder import RunFolder, claimed
 from ..workflows.track import track
-from .folder import DONE, FAILED, SeriesFolder, TaskState
+from .folder import DONE, FAILED, Row, SeriesFolder, TaskState, read_row, write_row
 from .plan import Moment, SeriesPlan, Source, Window, at, fingerprint
-from .rows import Row, read_row, write_row
 from .time import PHASE, Before, Shot, reconstruct_time, write_phase
 
-Told = Callable[[Row], None]
+OnRow = Callable[[Row], None]
 """Called with every row that is written."""
 
 
@@ -37,7 +36,7 @@ def nothing(row: Row) -> None:
     """Nobody wants to know."""
 
 
-def run_task(folder: SeriesFolder, number: int, on_row: Told = nothing) -> TaskState:
+def run_task(folder: SeriesFolder, number: int, on_row: OnRow = nothing) -> TaskState:
     """Do the rest of a task, and return its progress.
 
     Every time has its run folder and its row, written whole: after a kill, the task goes on in the middle of the time
@@ -63,7 +62,7 @@ def run_task(folder: SeriesFolder, number: int, on_row: Told = nothing) -> TaskS
     return folder.state(window)
 
 
-def _work(folder: SeriesFolder, plan: SeriesPlan, window: Window, on_row: Told) -> str:
+def _work(folder: SeriesFolder, plan: SeriesPlan, window: Window, on_row: OnRow) -> str:
     """Do the times; why not all of them could be, or nothing."""
     scans = Scans(plan)
     if plan.settings.act == "track":

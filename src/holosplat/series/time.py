@@ -24,7 +24,7 @@ from ..workflows.evaluate import Evaluation, evaluate
 from ..workflows.reconstruct import reconstruct
 from ..workflows.reconstruction import Reconstruction
 from ..workflows.run_folder import RunFolder, claimed
-from .rows import Begun, Body, Row
+from .folder import Begun, Body, Row
 from .settings import Settings
 
 PHASE = "phase.npy"

@@ -1,8 +1,9 @@
-from .blast import Blast as Blast
 from .capsules import Capsule as Capsule
 from .capsules import place_capsules as place_capsules
 from .carried import CarriedScene as CarriedScene
 from .carried import Twist as Twist
+from .carried import collapsing_foam as collapsing_foam
+from .carried import stirred_blob as stirred_blob
 from .continuous import Bump as Bump
 from .continuous import ContinuousScene as ContinuousScene
 from .continuous import Element as Element
@@ -12,6 +13,7 @@ from .drawn import Drawn as Drawn
 from .drawn import Substances as Substances
 from .flow.suspension import Medium as Medium
 from .flow.suspension import Suspension as Suspension
+from .fluids import Blast as Blast
 from .fluids import BreakUp as BreakUp
 from .fluids import Bubbles as Bubbles
 from .fluids import Cuvette as Cuvette
@@ -42,8 +44,6 @@ from .soft_matter import round_cell as round_cell
 from .soft_matter import shepp_logan as shepp_logan
 from .soft_matter import soft_cells as soft_cells
 from .soft_matter import tissue as tissue
-from .soft_motion import collapsing_foam as collapsing_foam
-from .soft_motion import stirred_blob as stirred_blob
 from .solids import Channel as Channel
 from .solids import Crack as Crack
 from .solids import Fibres as Fibres

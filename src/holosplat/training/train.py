@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -18,7 +17,7 @@ from torch.nn.utils import clip_grad_norm_
 
 from ..backends import missing
 from ..checks import InputError, as_written, require
-from ..io.atomic import atomic_path
+from ..io.atomic import atomic_path, write_rows
 from ..io.json import read_json, write_json
 from ..learning.network import Guess
 from ..learning.weights import Card, write_weights
@@ -158,7 +157,7 @@ class Training:
         state: dict[str, Any] = {name: part.state_dict() for name, part in self.parts().items()}
         with atomic_path(self.folder / CHECKPOINT) as temporary:
             torch.save(state | {"step": self.step, "rows": [list(row) for row in self.rows]}, temporary)
-        _write_rows(self.folder / CURVES, self.columns, self.rows)
+        write_rows(self.folder / CURVES, self.columns, ([f"{value:.6g}" for value in row] for row in self.rows))
         validation.write(self.folder)
 
     def finish(self, validation: Validation, made_by: dict[str, str]) -> Path:
@@ -195,13 +194,6 @@ def _settings(data: Dataset, options: TrainOptions) -> dict[str, Any]:
     """What a training is resumed with again."""
     scenes = {"ranges": to_table(data.ranges), "seed": data.seed, "count": data.count}
     return {"options": to_table(options), "scenes": scenes}
-
-
-def _write_rows(path: Path, columns: Sequence[str], rows: Sequence[tuple[float, ...]]) -> None:
-    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(columns)
-        writer.writerows([f"{value:.6g}" for value in row] for row in rows)
 
 
 def limits(ranges: Ranges, views: Sequence[int], scores: Mapping[str, Mapping[str, float]]) -> str:

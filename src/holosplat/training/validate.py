@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from ..io.atomic import atomic_path
+from ..io.atomic import write_rows
 from ..learning.network import Guess
 from ..learning.start import unexplained
 from ..learning.weights import Card
@@ -63,10 +62,7 @@ class Validation:
 
     def write(self, folder: Path) -> None:
         """Write all rows, whole or not at all."""
-        with atomic_path(folder / FILE) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            writer.writerow(self.columns)
-            writer.writerows([f"{value:.6g}" for value in row] for row in self.rows)
+        write_rows(folder / FILE, self.columns, ([f"{value:.6g}" for value in row] for row in self.rows))
 
     def card(self, network: nn.Module, trained_on: dict[str, Any], made_by: dict[str, str]) -> Card:
         """What `network` scores here, as a card."""

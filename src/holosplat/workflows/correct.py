@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from ..checks import require
-from ..frames import Frames
+from ..frames import Derived, Taken
 from ..io.atomic import require_apart, require_writable
 from ..io.formats import loader_of, open_raw
 from ..io.nxtomo import scan_writer
@@ -175,9 +175,9 @@ def correct(
     reading: values that the file lacks, and the part of it to take
 
     One frame is in memory at a time. Defective pixels, marked in the file or found in its darks and flats, are filled
-    from their neighbours; frames are turned upright, corrected as a whole, and then cut. The result counts frames,
-    defective pixels and components. Errors: `InputError` for a file without flats, for too many defective pixels, and
-    where `out` cannot be written.
+    from their neighbours and marked in the result; frames are turned upright, corrected as a whole, and then
+    cut. The result counts frames, defective pixels and components. Errors: `InputError` for a file without flats, for
+    too many defective pixels, and where `out` cannot be written.
 
     Examples:
 
@@ -215,8 +215,10 @@ def correct(
             described["rings"] = f"{options.rings} columns, {normal.pattern.std():.3%} (rms)"
         frames, doubt = _Corrected(fielding, normal), normal.light and normal.light.doubt
         whole = Scan.of(frames, file.exposures, file.is_test, file.provenance() | described, doubt)
-        scan = reading.applied(whole)
-        with scan_writer(out, scan.exposures, scan.is_test, scan.provenance, light=scan.light) as add:
+        scan = reading.applied(whole, joined=False)
+        lacks = scan[[0]].missing
+        kept = {"light": scan.light, "mask": None if lacks is None else lacks[0]}
+        with scan_writer(out, scan.exposures, scan.is_test, scan.provenance, **kept) as add:
             shown = set(np.linspace(0, len(scan) - 1, LOOKED_AT).round().astype(int).tolist())
             written = []
             for i in range(len(scan)):
@@ -281,17 +283,19 @@ class Normalisation:
         return frame / by
 
 
-class _Corrected(Frames):
+class _Corrected(Derived):
     """The projections of an open raw file, corrected when they are read."""
 
     def __init__(self, fielding: FlatFielding, normal: Normalisation) -> None:
         self._fielding, self._numbers, self._normal = fielding, fielding.file.numbers(PROJECTION), normal
         self.shape = (len(self._numbers), *fielding.dark.shape)
 
-    def read(self, numbers: np.ndarray) -> np.ndarray:
-        """See `Frames.read`."""
+    def with_missing(self, numbers: np.ndarray) -> Taken:
+        """See `Frames.with_missing`."""
         read = [self._normal(int(i), self._fielding(int(self._numbers[i]))) for i in numbers]
-        return np.stack(read).astype(np.float32)
+        mask = self._fielding.repair.mask
+        missing = np.broadcast_to(mask, (len(numbers), *mask.shape)) if mask.any() else None
+        return np.stack(read).astype(np.float32), missing
 
 
 def _mean_and_noise(file: ScanFile, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

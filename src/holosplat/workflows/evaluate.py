@@ -256,12 +256,17 @@ def score_object(
         data_range = intensity_range(scan.train().frames)
         lit = np.ones((len(scan), 1, 1), dtype=np.float32) if light is None else light
         fitted = render_object(obj, scan.train().exposures, oversample, backend) * lit[~scan.is_test]
-        train = image_scores(fitted, scan.train().frames, data_range)
+        train = image_scores(known(fitted, scan.train()), scan.train().frames, data_range)
         if len(scan.test()):
             predicted = render_object(obj, scan.test().exposures, oversample, backend) * lit[scan.is_test]
-            test = image_scores(predicted, scan.test().frames, data_range)
+            test = image_scores(known(predicted, scan.test()), scan.test().frames, data_range)
     volume = None if truth is None else volume_scores(obj.voxelise(truth.grid), truth)
     return Scores(test, train, volume, predicted)
+
+
+def known(predicted: np.ndarray, measured: Scan) -> np.ndarray:
+    """Predicted frames [V, H, W] with the values of those measured in missing pixels, which score nothing so."""
+    return predicted if measured.missing is None else np.where(measured.missing, measured.frames, predicted)
 
 
 def material_found(found: Stored) -> MaterialFound:

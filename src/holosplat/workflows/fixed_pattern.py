@@ -9,7 +9,6 @@ import torch
 
 from ..baselines import HolographicTV
 from ..checks import require
-from ..frames import divided
 from ..matter import MaterialPrior
 from ..methods.illumination import predicted_first
 from ..optics.patterns import mean_light
@@ -73,5 +72,4 @@ def flatfield_corrected(
     """The scan with all frames, held-out ones too, divided by the fixed pattern of the training frames."""
     light = estimate_fixed_pattern(scan, prior, options, on_progress)
     said = {"still_light": f"{np.log(light).std():.2%} (rms), order {options.order}, divided out"}
-    frames, provenance = divided(scan.source, light[None]), scan.provenance | said
-    return Scan.of(frames, scan.exposures, scan.is_test, provenance, scan.light)
+    return scan.divided(light[None], said)

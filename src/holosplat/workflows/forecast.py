@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
@@ -10,7 +9,7 @@ import numpy as np
 import torch
 
 from ..checks import InputError, as_written, positive, require
-from ..io.atomic import atomic_path
+from ..io.atomic import write_rows
 from ..io.json import write_json
 from ..io.nxtomo import write_scan
 from ..io.objects import write_object
@@ -177,11 +176,8 @@ def write_forecast(folder: RunFolder, run: Reconstruction, found: Forecasted, co
     told = {"steps": 0, "times_s": said.times.tolist(), "bodies": said.bodies.count}
     folder.write_summary(summary_of(done, None, found.predicted) | told)
     write_scan(folder.path / FRAMES, found.predicted)
-    with atomic_path(folder.path / TABLE) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["time_s", "body", "standard_error_m"])
-        rows = zip(said.times, said.band)
-        writer.writerows([f"{t:.7g}", k, f"{error:.4g}"] for t, band in rows for k, error in enumerate(band))
+    errors = ([f"{t:.7g}", k, f"{e:.4g}"] for t, band in zip(said.times, said.band) for k, e in enumerate(band))
+    write_rows(folder.path / TABLE, ["time_s", "body", "standard_error_m"], errors)
     band = [None if np.isnan(one) else float(one) for one in said.usual_band()]
     write_json(
         folder.path / NUMBERS,

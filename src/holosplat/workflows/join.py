@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -61,12 +61,22 @@ def join(
     with scan_writer(out, joined, is_test, described, light=_light(scans, flips, joined)) as add:
         for n, (scan, resampling) in enumerate(zip(scans, resamplings)):
             rows, columns = FLIPS[flips[n]] if flips else (False, False)
-            for frame in (frame for block in scan.blocks() for frame in block):
-                turned = frame[:: -1 if rows else 1, :: -1 if columns else 1]
-                add(turned if resampling is None else resampling(turned))
+            for frame, missing in _one_by_one(scan):
+                turn = (slice(None, None, -1 if rows else 1), slice(None, None, -1 if columns else 1))
+                turned, lacks = frame[turn], None if missing is None else missing[turn]
+                if resampling is not None:
+                    turned = resampling(turned)
+                    lacks = None if lacks is None else resampling(lacks.astype(np.float32)) > 0.5  # most of it
+                add(turned, lacks)
                 done += 1
                 on_progress(done / len(joined))
     return joined
+
+
+def _one_by_one(scan: Scan) -> Iterator[tuple[np.ndarray, np.ndarray | None]]:
+    """The frames [H, W], each with its missing pixels."""
+    for frames, missing in scan.blocks_with_missing():
+        yield from ((frame, None if missing is None else missing[i]) for i, frame in enumerate(frames))
 
 
 def _placed(joined: Exposures, geometry: Path) -> Exposures:

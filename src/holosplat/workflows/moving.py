@@ -10,23 +10,24 @@ from ..matter import KnownSeveral, MaterialPrior
 from ..methods import Task
 from ..methods.assumed import assumed_material
 from ..methods.illumination import prepared
-from ..motion.flow_reconstruction import NOWHERE, CarriedOptions, Search, merged
+from ..motion.flow_reconstruction import NOWHERE, FlowOptions, FlowSearch, merged
 from ..optics.background import LightOptions
 from ..optics.sampling import fringe_sampling
 from ..progress import FitProgress
 from ..representations import VoxelGrid
 from ..scan import Scan
 from ..tables import to_table
+from .choice import Choice
 from .preconditions import check_frames, goes_on
 from .provenance import environment
-from .reconstruction import Assumptions, Choice, Reconstruction, config_of, write_run
+from .reconstruction import Assumptions, Reconstruction, config_of, write_run
 from .run_folder import Checkpoint, RunFolder
 from .run_illumination import light_options_of
 from .verdict import judge
 
 KIND = "carried"
 """The method's name in the files of a run."""
-USUAL = CarriedOptions()
+USUAL = FlowOptions()
 """The options by default."""
 
 
@@ -43,7 +44,7 @@ class FlowReconstruction:
 def reconstruct_moving(
     scan: Scan,
     prior: MaterialPrior,
-    options: CarriedOptions = USUAL,
+    options: FlowOptions = USUAL,
     seed: int = 0,
     *,
     light: LightOptions | None = None,
@@ -78,7 +79,7 @@ def reconstruct_moving(
     task = prepared(Task(train, prior, seed, lambda stage, part: on_progress(stage, part, {}), assumed))
     mean = merged(task.scan)
     material = assumed_material(mean, task.prior, task.on_progress)
-    search = Search(task, material, options, NOWHERE if folder is None else Checkpoint(folder))
+    search = FlowSearch(task, material, options, NOWHERE if folder is None else Checkpoint(folder))
     if going:
         search.take_up()
     elif ask and not search.moves(search.by_itself(mean, "mean of all times")):

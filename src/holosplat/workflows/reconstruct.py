@@ -32,6 +32,7 @@ from ..ranges import require_plausible
 from ..representations import KINDS, Stored
 from ..scan import Scan
 from ..tables import to_table
+from .choice import Choice
 from .preconditions import (
     check_frames,
     decided_before,
@@ -42,7 +43,7 @@ from .preconditions import (
     require_one_time,
 )
 from .provenance import environment, scan_hash
-from .reconstruction import Assumptions, Choice, Reconstruction, config_of, read_rest, write_run
+from .reconstruction import Assumptions, Reconstruction, config_of, read_rest, write_run
 from .refine import (
     freedom_of,
     keep_geometry,

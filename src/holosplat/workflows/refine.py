@@ -12,8 +12,7 @@ import torch
 from ..align.find import align_views
 from ..align.geometry import Geometry
 from ..align.held_out import fitted_frames, place_frames
-from ..align.poses import PoseOptions
-from ..align.poses import Uncertain as Where
+from ..align.poses import PoseOptions, PosePrior
 from ..align.views import KINDS
 from ..checks import as_written, require
 from ..fit.pose_refinement import PoseRefinement
@@ -60,7 +59,7 @@ def saved_geometry(folder: RunFolder | None, resume: bool) -> Geometry | None:
         return None if table is None else Geometry.from_dict(table)
 
 
-def still_uncertain(geometry: Geometry, uncertain: Where) -> Where:
+def still_uncertain(geometry: Geometry, uncertain: PosePrior) -> PosePrior:
     """`uncertain` without what stayed as planned for all training frames."""
     changes = geometry.changes[~geometry.held_out]
     return replace(uncertain, **{name: 0.0 for name in KINDS if not _moved(changes, KINDS[name])})

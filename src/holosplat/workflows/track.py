@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import shutil
 from collections.abc import Mapping
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from ..checks import as_written, require
 from ..fit.residuals import Prediction
-from ..io.atomic import atomic_path
+from ..io.atomic import write_rows
 from ..io.folder import atomic_folder
 from ..io.pvd import TimeStep, write_pvd
 from ..io.vtk import write_mesh
@@ -27,9 +26,10 @@ from ..progress import FitProgress
 from ..representations import MovingSurfaces
 from ..scan import Scan
 from ..tables import read_rows, to_table
+from .choice import Choice
 from .preconditions import check_frames, goes_on
 from .provenance import environment
-from .reconstruction import Assumptions, Choice, Reconstruction, config_of, write_rest, write_run
+from .reconstruction import Assumptions, Reconstruction, config_of, write_rest, write_run
 from .run_folder import Checkpoint, RunFolder, claimed
 from .run_illumination import light_options_of
 from .verdict import judge
@@ -162,11 +162,11 @@ def write_tracks(
 ) -> None:
     """tracks.csv, with `more` columns [T, B] by their names, and bodies.pvd with one file a body and time."""
     times, steps, beside = scan.instants, list[TimeStep](), more or {}
-    with atomic_path(folder.path / TRACKS) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow([*columns(), *beside])
-        for k, one in enumerate(measured(bodies, scan.exposures)):
-            writer.writerow([*row(one), *(f"{column.ravel()[k]:.4g}" for column in beside.values())])
+    rows = (
+        [*row(one), *(f"{column.ravel()[k]:.4g}" for column in beside.values())]
+        for k, one in enumerate(measured(bodies, scan.exposures))
+    )
+    write_rows(folder.path / TRACKS, [*columns(), *beside], rows)
     if (folder.path / BODIES).is_dir():  # of a run that was cut off when it wrote
         shutil.rmtree(folder.path / BODIES)
     with atomic_folder(folder.path / BODIES) as temporary:

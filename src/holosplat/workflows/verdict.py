@@ -125,7 +125,7 @@ that are looked at."""
 def judge(said: Prediction, frames: Scan, noise: NoiseModel | None = None) -> Verdict:
     """The verdict on a prediction of `frames`, whose exposures the prediction has; noise: None to estimate it."""
     measured = torch.from_numpy(frames.frames)
-    left = residuals(said, measured, (noise or _noise(measured)).power())
+    left = residuals(said, measured, (noise or _noise(measured)).power(), missing=frames.gaps)
     found = verdict(left)
     absorbing, refracting = _matter(said)
     if not bool(absorbing.any() or refracting.any()):

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
+
+import numpy as np
 
 from holosplat.methods import (
     Auto,
     Gaussians,
     HolographicVoxels,
+    Method,
     NeuralFields,
     Onix,
     PerView,
@@ -20,10 +23,11 @@ from holosplat.methods import (
 )
 from holosplat.methods.per_view import SVMBIR
 from holosplat.methods.presets import preset
+from holosplat.planning.needs import Costs, Needs, Sizes, of_fit, of_simulation
+from holosplat.scan import Exposures
 
 from ..opponents.photographs import AlphaSplats, RadianceFields
-from .aligners import ALIGNERS
-from .method import Method
+from .method import ALIGNERS, BenchMethod
 
 PER_VIEW = "phase retrieval of each view, then tomography"
 VOXELS = "voxels through the waves"
@@ -35,13 +39,13 @@ PHOTOGRAPHS = "holograms taken for photographs, without waves"
 AUTO = "chosen by the frames"
 
 
-def methods(effort: float = 1.0) -> dict[str, Method]:
+def methods(effort: float = 1.0) -> dict[str, BenchMethod]:
     """Name → method. effort: share of the steps of those that fit in many steps (1: as published)."""
     table = (*_as_photographs(effort), *_per_view(), *_through_waves(effort))
     return {method.name: method for method in table}
 
 
-def _per_view() -> list[Method]:
+def _per_view() -> list[BenchMethod]:
     """Paganin with every tomography, then every other phase retrieval with the best of them."""
     plain = {
         "fbp": "filtered back-projection",
@@ -63,19 +67,19 @@ def _per_view() -> list[Method]:
         "admm": "ADMM",
     }
     rows += [(f"{name}-tv", f"{what}, total variation in [0, 1]", PerView(name, "tv")) for name, what in others.items()]
-    return [Method(name, PER_VIEW, summary, options) for name, summary, options in rows]
+    return [BenchMethod(name, PER_VIEW, summary, options) for name, summary, options in rows]
 
 
-def _as_photographs(effort: float) -> list[Method]:
+def _as_photographs(effort: float) -> list[BenchMethod]:
     """Both from a random start."""
     splats, field = AlphaSplats().with_effort(effort), RadianceFields().with_effort(effort)
     return [
-        Method(splats.kind, PHOTOGRAPHS, "opaque Gaussians laid over each other (Kerbl et al. 2023)", splats),
-        Method(field.kind, PHOTOGRAPHS, "radiance field with positional encoding (Mildenhall et al. 2020)", field),
+        BenchMethod(splats.kind, PHOTOGRAPHS, "opaque Gaussians laid over each other (Kerbl et al. 2023)", splats),
+        BenchMethod(field.kind, PHOTOGRAPHS, "radiance field with positional encoding (Mildenhall et al. 2020)", field),
     ]
 
 
-def _through_waves(effort: float) -> list[Method]:
+def _through_waves(effort: float) -> list[BenchMethod]:
     rows: list[tuple[str, str, str, Any]] = [
         (
             "holographic-tv",
@@ -144,7 +148,7 @@ def _through_waves(effort: float) -> list[Method]:
             replace(Auto(), gaussians=replace(Auto().gaussians, start="learned")).with_effort(effort),
         ),
     ]
-    return [Method(*row) for row in rows]
+    return [BenchMethod(*row) for row in rows]
 
 
 METHODS = methods()
@@ -157,7 +161,7 @@ ON_ALIGNED = {
 """The methods that also run on views which were aligned before, and how."""
 
 
-def aligned(table: Mapping[str, Method]) -> dict[str, Method]:
+def aligned(table: Mapping[str, BenchMethod]) -> dict[str, BenchMethod]:
     """Name → method of `ON_ALIGNED`, such as `tikhonov-tv+mass`."""
     found = {}
     for name, ways in ON_ALIGNED.items():
@@ -170,3 +174,23 @@ def aligned(table: Mapping[str, Method]) -> dict[str, Method]:
 
 ALIGNED = aligned(METHODS)
 """Methods that are run where they are named, for cases whose beams are not where they should be."""
+
+
+JUDGED = 60.0
+"""Bytes of a voxel of a case whose truth and result are compared (`benchmarks/needs_acts.py`)."""
+
+
+def of_methods(exposures: Exposures, is_test: np.ndarray, samples: int, methods: Sequence[Method]) -> Needs:
+    """What a case of the benchmark takes, with such frames, of which some are held out, and so many wave samples along
+    a pixel of its simulation."""
+    sizes, voxels = Sizes.of(exposures[~is_test]), Sizes.of(exposures).voxels
+    each = [needs for method in methods if (needs := of_fit(sizes, method)) is not None]
+    made = of_simulation(exposures, samples, len(exposures))
+    memory = max([made.memory, *(needs.memory for needs in each)]) + JUDGED * voxels
+    disk = made.disk + 2 * Costs.written * voxels + 1e6 * len(each)
+    return Needs(memory, disk, 10 + sum(needs.seconds for needs in each))
+
+
+def of_benchmark(cases: Sequence[Needs]) -> Needs:
+    """What several cases take, one after the other."""
+    return Needs(max(one.memory for one in cases), sum(one.disk for one in cases), sum(one.seconds for one in cases))

@@ -5,10 +5,18 @@ from __future__ import annotations
 import gc
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Protocol, cast, runtime_checkable
 
+import numpy as np
+from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.spatial.transform import Rotation
+
+from holosplat.align.held_out import place_frames
+from holosplat.align.poses import PoseOptions
 from holosplat.backends import resolve
 from holosplat.beamline.declared.case import Case
 from holosplat.checks import InputError, require
@@ -17,22 +25,143 @@ from holosplat.optics.sampling import fringe_sampling
 from holosplat.progress import Progress
 from holosplat.representations import Stored
 from holosplat.scan import Scan
+from holosplat.specimens.phantoms import Ball
+from holosplat.specimens.scene import MeshScene
 from holosplat.version import source_commit
 from holosplat.volume import Object, Volume
 from holosplat.workflows.evaluate import Scores, score_object
 from holosplat.workflows.provenance import environment, scan_hash
 
-from .aligners import Aligner
-from .folder import BenchFolder, good_name
+from .folder import REFERENCE, BenchFolder, Row, good_name
 from .measured import MeasuredCase, agreement
-from .method import Method
-from .moved import judged_with
+from .method import Aligner, BenchMethod
 from .pictures import TRUTH, Arrays, method_picture, truth_picture
 from .prepare import prepared
-from .record import memory_growth
 from .references import Reference
-from .rows import REFERENCE, Row
-from .sizes import contrast_by_size
+
+BLURS = (3.0, 1.0)
+"""Gaussian blurs of both volumes [voxels], one after the other: a wide one catches moves of some voxels."""
+ROUNDS = 6
+"""Gauss–Newton steps at each blur; they settle in four."""
+PLACING = 4
+"""Rounds in which frames are placed on each size of pixels: the matter is known, and errors are of a pixel."""
+
+
+@dataclass(frozen=True)
+class Move:
+    """`x' = R x + t`: rotation [3, 3], translation [3] [m]."""
+
+    rotation: np.ndarray
+    translation: np.ndarray
+
+    @classmethod
+    def best(cls, truth: Volume, found: Volume) -> Move:
+        """The move of `truth` onto `found`, both on one grid of cubic voxels, with the least squares of δ."""
+        voxel = truth.grid.voxel_size[0]
+        axes = [(axis - middle) / voxel for axis, middle in zip(truth.grid.axes(), truth.grid.centre)]
+        z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
+        points = np.stack([x, y, z], axis=-1)
+        scale = float(np.abs(truth.delta).max())
+        rotation, translation = np.eye(3), np.zeros(3)
+        for blur in BLURS:
+            still, target = (gaussian_filter(volume.delta / scale, blur) for volume in (truth, found))
+            for _ in range(ROUNDS):
+                turn, step = _step(still, target, points, rotation, translation)
+                rotation, translation = turn @ rotation, turn @ translation + step
+        middle = truth.grid.centre
+        return cls(rotation, voxel * translation + middle - rotation @ middle)
+
+    def of(self, scene: MeshScene) -> MeshScene:
+        """The moved scene."""
+        meshes = tuple(mesh.transformed(self.rotation, self.translation) for mesh in scene.meshes)
+        return replace(scene, meshes=meshes)
+
+
+def _step(
+    still: np.ndarray, target: np.ndarray, points: np.ndarray, rotation: np.ndarray, translation: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The turn [3, 3] and then the translation [3] [voxels] that bring `still`, moved as it is, nearer to `target`.
+
+    A small turn ω and translation τ change the moved volume f by `-(ω × x + τ) · ∇f`.
+    """
+    back = (points - translation) @ rotation + 0.5 * (np.array(still.shape[::-1]) - 1)
+    moved = map_coordinates(still, np.moveaxis(back[..., ::-1], -1, 0), order=1)
+    slopes = np.stack([np.asarray(np.gradient(moved, axis=axis)) for axis in (2, 1, 0)], axis=-1)
+    near = (slopes**2).sum(-1) > 0
+    slopes, missing, at = slopes[near], (target - moved)[near], points[near]
+    columns = -np.concatenate([np.cross(at, slopes), slopes], axis=1)
+    found = np.linalg.lstsq(columns.T @ columns, columns.T @ missing, rcond=1e-12)[0]
+    return Rotation.from_rotvec(found[:3]).as_matrix(), found[3:]
+
+
+def judged_with(case: Case, found: Stored, scan: Scan, truth: Volume, on_progress: Progress) -> tuple[Scan, Volume]:
+    """The frames of `scan` where they fit `found` best, and the truth moved onto it; errors: `InputError` for scenes
+    without meshes."""
+    if not isinstance(case.scene, MeshScene):
+        raise InputError(f"beams of {case.name} are elsewhere, for which the scene must be of meshes.")
+    moved = Move.best(truth, found.voxelise(truth.grid)).of(case.scene).voxelise(truth.grid)
+    placed = place_frames(found, scan, PoseOptions(rounds=PLACING), on_progress).exposures
+    return Scan(scan.frames, placed, scan.is_test, scan.provenance), moved
+
+
+HALF_DIAGONAL = 0.5 * np.sqrt(3.0)
+"""From a voxel's centre to its corner, in voxels: a ball of this radius holds a voxel's centre wherever it lies."""
+
+
+def contrast_by_size(found: Volume, truth: Volume, balls: Sequence[Ball]) -> tuple[np.ndarray, np.ndarray]:
+    """Diameters [S] [m], falling, and the contrast [S] of the balls of each, as a part of the true one.
+
+    A ball's contrast is the mean δ within it, less the mean δ in the shell around it as wide as its radius; both
+    volumes lie on one grid of cubic voxels. 1: all of it is left; 0: nothing is seen.
+    """
+    contrast = np.array([[_contrast(volume, ball) for volume in (found, truth)] for ball in balls])
+    diameters = np.array([ball.diameter for ball in balls])
+    sizes = np.unique(diameters)[::-1]
+    sums = np.stack([contrast[diameters == size].sum(axis=0) for size in sizes])
+    return sizes, sums[:, 0] / sums[:, 1]
+
+
+def _contrast(volume: Volume, ball: Ball) -> float:
+    """Mean δ in `ball` less that around it; with room for the blur of a voxel between the two."""
+    pitch, radius = volume.grid.voxel_size[0], 0.5 * ball.diameter
+    reach = max(2 * radius, radius + 1.5 * pitch)
+    near = [np.flatnonzero(np.abs(axis - c) <= reach) for axis, c in zip(volume.grid.axes(), ball.centre)]
+    x, y, z = (axis[i] - c for axis, i, c in zip(volume.grid.axes(), near, ball.centre))
+    distance = np.sqrt(z[:, None, None] ** 2 + y[None, :, None] ** 2 + x[None, None, :] ** 2)
+    values = volume.delta[np.ix_(near[2], near[1], near[0])].astype(np.float64)
+    inside = distance <= max(radius, HALF_DIAGONAL * pitch)
+    around = (distance > radius + 0.5 * pitch) & (distance <= reach)
+    return float(values[inside].mean() - values[around].mean())
+
+
+STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+RESET_PEAK = "5"
+"""What Linux takes to forget the peak of a process's memory (proc(5), clear_refs)."""
+
+
+@contextmanager
+def memory_growth() -> Iterator[Callable[[], int | None]]:
+    """Yields a function: by how many bytes the process's memory grew at its peak since; None where Linux is not."""
+    before = None
+    with suppress(OSError):
+        CLEAR.write_text(RESET_PEAK)
+        before = _status("VmRSS")
+
+    def growth() -> int | None:
+        peak = _status("VmHWM")
+        return None if before is None or peak is None else max(0, peak - before)
+
+    yield growth
+
+
+def _status(key: str) -> int | None:
+    """An entry of /proc/self/status [bytes]."""
+    try:
+        lines = STATUS.read_text(encoding="ascii", errors="replace").splitlines()
+        return 1024 * next(int(line.split()[1]) for line in lines if line.startswith(key + ":"))
+    except (OSError, StopIteration):
+        return None
+
 
 TRUTH_THRESHOLD = 0.5
 """Shell correlation with a noise-free truth at which the resolution is read: 0.143 between two halves of the data
@@ -45,7 +174,7 @@ class Suite:
 
     cases: Sequence[str]
     seeds: Sequence[int]
-    methods: Mapping[str, Method]
+    methods: Mapping[str, BenchMethod]
     references: Mapping[str, Reference]
     load: Callable[[str, int], Case | MeasuredCase]
 
@@ -208,7 +337,9 @@ def _of_reference(reference: Reference, bench: _Bench) -> Callable[[Progress], O
     return lambda on_progress: reference.run(bench.case, bench.truth, on_progress)
 
 
-def _of_method(method: Method, train: Scan, case: Case | MeasuredCase, bench: _Bench) -> Callable[[Progress], Object]:
+def _of_method(
+    method: BenchMethod, train: Scan, case: Case | MeasuredCase, bench: _Bench
+) -> Callable[[Progress], Object]:
     def produce(on_progress: Progress) -> Object:
         scan, aligner = train, method.aligner
         if aligner is not None:

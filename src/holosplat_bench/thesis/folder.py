@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ import numpy as np
 import torch
 
 from holosplat.checks import as_written, require
-from holosplat.io.atomic import atomic_path
+from holosplat.io.atomic import atomic_path, write_rows
 from holosplat.io.folder import require_new
 from holosplat.io.guard import read_archive
 from holosplat.io.json import read_json, write_json
@@ -73,10 +72,8 @@ class StudyFolder:
 
     def write_curves(self, name: str, looks: Sequence[Look]) -> None:
         """NAME.curves.csv, of everything seen so far."""
-        with atomic_path(self._file(name, "curves.csv")) as temporary, temporary.open("w", newline="") as file:
-            table = csv.DictWriter(file, CURVES, lineterminator="\n")
-            table.writeheader()
-            table.writerows({key: f"{look[key]:.6g}" for key in CURVES} for look in looks)
+        rows = ([f"{look[key]:.6g}" for key in CURVES] for look in looks)
+        write_rows(self._file(name, "curves.csv"), CURVES, rows)
 
     def curves(self, name: str) -> dict[str, np.ndarray]:
         """The columns of NAME.curves.csv, float64."""

@@ -30,9 +30,8 @@ from holosplat.volume import Object
 from holosplat.workflows.evaluate import score_object
 from holosplat.workflows.provenance import environment, scan_hash
 
-from .configurations import THESIS_TABLE, Configuration, Pace, Recipe
+from .configurations import THESIS_TABLE, Configuration, Measured, Pace, Recipe, mean_inside
 from .folder import CURVES, StudyFolder
-from .measured import Measured, mean_inside
 
 
 class DenseCloud(GaussianCloud):

@@ -40,8 +40,7 @@ from holosplat_bench.opponents.moving import (
 from holosplat_bench.opponents.moving.deformed_voxels import Deformation
 from holosplat_bench.opponents.moving.hexplane_field import HexPlanes
 from holosplat_bench.opponents.moving.moving_voxels import OnVoxels
-from holosplat_bench.opponents.moving.through_waves import spectral_objective, weight_of
-from holosplat_bench.opponents.moving.times import DrawnTimes
+from holosplat_bench.opponents.moving.times import DrawnTimes, spectral_objective, weight_of
 
 PIXEL, SHAPE = 1e-6, (21, 17)
 MATTER = DeltaBeta(8e-7, 8e-10)

@@ -15,8 +15,7 @@ from holosplat.mesh import TriangleMesh
 from holosplat.scan import Exposures, interleaved_split
 from holosplat.specimens.red_cells import icosphere
 from holosplat.specimens.scene import MeshScene
-from holosplat_bench.thesis.configurations import THESIS_TABLE, Configuration
-from holosplat_bench.thesis.measured import Measured
+from holosplat_bench.thesis.configurations import THESIS_TABLE, Configuration, Measured
 
 
 @pytest.fixture(scope="session")

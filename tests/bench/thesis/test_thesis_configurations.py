@@ -13,8 +13,17 @@ from holosplat.geometry import Grid, Views
 from holosplat.materials import WATER
 from holosplat.methods.presets import preset
 from holosplat.volume import Volume
-from holosplat_bench.thesis.configurations import EVERY, PACES, THESIS_TABLE, Configuration, Pace, configurations
-from holosplat_bench.thesis.measured import PHYSICS, Measured, mean_inside
+from holosplat_bench.thesis.configurations import (
+    EVERY,
+    PACES,
+    PHYSICS,
+    THESIS_TABLE,
+    Configuration,
+    Measured,
+    Pace,
+    configurations,
+    mean_inside,
+)
 from holosplat_bench.thesis.study import DenseCloud, random_start
 
 PIXEL = 1e-6

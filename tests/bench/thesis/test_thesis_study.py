@@ -12,15 +12,15 @@ import pytest
 from holosplat.checks import InputError
 from holosplat.fit.loop import Fit
 from holosplat.materials import HAEMOGLOBIN
-from holosplat_bench.cli import thesis as command
+from holosplat_bench.cli import bench as command
 from holosplat_bench.suite import case as bench_case
+from holosplat_bench.suite.pages.page import as_markdown, escaped
 from holosplat_bench.thesis import study as thesis_study
-from holosplat_bench.thesis.configurations import EVERY, PACES, THESIS_TABLE, Pace
+from holosplat_bench.thesis.configurations import EVERY, PACES, THESIS_TABLE, Measured, Pace
 from holosplat_bench.thesis.findings import findings
 from holosplat_bench.thesis.folder import CURVES, StudyFolder, load_study
-from holosplat_bench.thesis.measured import Measured
 from holosplat_bench.thesis.pages import page as report
-from holosplat_bench.thesis.pages.page import LINES, PICTURES, pictures, study_markdown, write_study
+from holosplat_bench.thesis.pages.page import LINES, PICTURES, page_of, pictures, write_study
 from holosplat_bench.thesis.study import run_study
 
 SMALL = replace(THESIS_TABLE[1], count=60, threshold=1.0, amplitude_rate=0.1)
@@ -115,7 +115,7 @@ def test_a_fit_that_diverges_is_a_result(measured, tmp_path, monkeypatch):
     run_study(measured, [SMALL], QUICK, 5, folder)
     row = load_study(folder).rows["8k-v4"]
     assert (row["status"], row["diverged_at"], row["last"]["step"]) == ("diverged", 7, 6)
-    assert "8k-v4 (diverged at step 7)" in study_markdown(load_study(folder), [])
+    assert "8k-v4 (diverged at step 7)" in as_markdown(page_of(load_study(folder)), tmp_path)
 
 
 def test_a_folder_of_something_else_or_of_another_study_is_refused(measured, tmp_path):
@@ -163,7 +163,7 @@ def test_the_report_says_what_the_files_say(study_of_all, tmp_path):
     rows = [line for line in text.splitlines() if line.startswith(("| 8k", "| 32k", "| 98k", "| 244k"))]
     assert [row.split(" | ")[0].strip("| ") for row in rows] == [c.name for c in THESIS_TABLE]
     for finding in findings(study):
-        assert f"| {finding.claim} | {finding.verdict} | {finding.evidence} |" in text
+        assert f"| {' | '.join(map(escaped, (finding.claim, finding.verdict, finding.evidence)))} |" in text
     assert [path.name for path in drawn] == [picture.file for picture in PICTURES]
     assert all(path.read_bytes().startswith(b"\x89PNG") and f"({path.name})" in text for path in drawn)
 

@@ -50,6 +50,7 @@ class SpectralMisfit:
         unit = phase * strongest
         self._unit = torch.from_numpy(unit).float()[:, None, None].to(on)
         self._amplitudes = torch.from_numpy(train.frames).clamp_min(0).sqrt().to(on)
+        self._missing = None if train.gaps is None else train.gaps.to(on)
         response = linear_response(exposures, ratio) / torch.from_numpy(strongest)[:, None, None]
         self.noise = noise_level(self._amplitudes) / float(unit.mean())
         """Standard deviation of r that the noise of the measured frames gives [pixels of thickness]."""
@@ -63,6 +64,8 @@ class SpectralMisfit:
         if index is not None:
             measured, weights, unit = measured[index], weights[index], unit[index]
         residual = (frames.clamp_min(DARKEST).sqrt() - measured) / unit
+        if self._missing is not None:
+            residual = residual.masked_fill(self._missing if index is None else self._missing[index], 0.0)
         shape = (residual.shape[-2], residual.shape[-1])
         weighted = torch.fft.irfft2(torch.fft.rfft2(residual) * weights, s=shape)
         return 0.5 * (residual * weighted).sum(dim=(1, 2))
@@ -97,6 +100,7 @@ Weighted = tuple[float | Tensor, Tensor]
 class FrameTerm:
     """The terms on frames: mean over the batch's views of the weighted sum of the comparisons in use.
 
+    The scan's missing pixels have no part in it.
     detach_worst: the thesis' rule, views whose loss exceeds the batch's median give no gradient. low, span: the affine
     map that takes the training frames' minimum and maximum to 0 and 1.
     """
@@ -112,6 +116,7 @@ class FrameTerm:
         self.span = high - self.low
         frames = measured.to(instrument.device)
         self._target = Target(frames, self.low, self.span, instrument.backend)
+        self._missing = None if train.gaps is None else train.gaps.to(frames.device)
         if objective.ssim > 0:
             _ = self._target.statistics  # once, for all subsets of views
         coarse = objective.coarse * min(1.0, noise_share(measured) / COARSEST_NOISE) if objective.coarse else 0.0
@@ -149,6 +154,9 @@ class FrameTerm:
     def compared(self, predicted: Tensor, batch: Batch) -> dict[str, Weighted]:
         """Weight and value [V] of every comparison in use."""
         w, target = self.objective, self._target if batch.index is None else self._target[batch.index]
+        if self._missing is not None:  # pixels without a value agree with any prediction
+            missing = self._missing if batch.index is None else self._missing.index_select(0, batch.index)
+            predicted = torch.where(missing, target.frames, predicted)
         fused = l1_and_ssim(predicted, target) if w.ssim > 0 else None
         a, b = ((f - self.low) / self.span if w.tv_image + w.frc > 0 else f for f in (predicted, target.frames))
         table: dict[str, Callable[[], Tensor]] = {

@@ -14,7 +14,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-BLOCK, WARPS = 512, 4
+BLOCK, WARPS = 256, 2
 """Samples of a program, and its warps."""
 
 Refraction = list[list[float]] | Tensor

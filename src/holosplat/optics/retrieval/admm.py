@@ -15,7 +15,7 @@ from ...scan import Exposures
 from .contact import or_in_contact
 from .model import Regularised, WaveModel, view_by_view
 from .nonlinear import EASE, FIRST_DAMPING, TIGHTEN
-from .spectra import Noise
+from .spectra import Gaps, Noise
 
 EDGE = 0.5
 """Jumps of phase that are taken for edges within one iteration, in mean slopes of the matter."""
@@ -38,6 +38,7 @@ def admm(
     beta: float,
     *,
     options: ADMM = ADMM(),
+    missing: Tensor | None = None,
     on_progress: Advance = lambda fraction: None,
 ) -> Tensor:
     """Thickness [V, H, W] in metres of one material, β of any sign, with edges: frames [V, H, W] through full waves.
@@ -50,12 +51,12 @@ def admm(
     optics in its place and total variation beside the bounds.
     """
 
-    def solve(frames: Tensor, exposures: Exposures, noise: Noise, on_progress: Advance) -> Tensor:
+    def solve(frames: Tensor, exposures: Exposures, noise: Noise, missing: Gaps, on_progress: Advance) -> Tensor:
         how = (options.backend, options.leaves, options.prior)
-        model = WaveModel(frames, exposures, beta / delta, noise, *how, sign=math.copysign(1.0, delta))
+        model = WaveModel(frames, exposures, beta / delta, noise, *how, sign=math.copysign(1.0, delta), missing=missing)
         return model.thickness(_alternate(model, options, on_progress), delta)
 
-    return view_by_view(frames, exposures, delta, options.noise, solve, on_progress)
+    return view_by_view(frames, exposures, delta, (options.noise, missing), solve, on_progress)
 
 
 def _alternate(model: WaveModel, options: ADMM, on_progress: Advance) -> Tensor:

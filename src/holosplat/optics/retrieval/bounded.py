@@ -15,7 +15,7 @@ from torch.nn.functional import max_pool2d
 
 from ...scan import Exposures
 from ..noise import wavelet_noise
-from .spectra import Noise, Prior, Raster, filtered, response, spectra, surrounded
+from .spectra import Gaps, Noise, Prior, Raster, completed, filtered, response, spectra, surrounded
 
 STEPS = 25
 """Alternations between the frame and the bound. Where noise hides the lowest frequencies they go on to drift."""
@@ -47,6 +47,8 @@ def bounded_estimate(
     leaves: bool = False,
     prior: Prior | None = None,
     sign: float = 1.0,
+    *,
+    missing: Gaps = None,
 ) -> Estimate:
     """From frames [V, H, W] of a material with β/δ = `ratio` and that `sign` of δ; noise: theirs, None to estimate it.
 
@@ -55,6 +57,7 @@ def bounded_estimate(
     `SIGNIFICANT` deviations of its noise and zero elsewhere, for noise with its negative half cut off would pass for
     matter (a support found anew in every round: the "shrinkwrap" of Marchesini et al. 2003).
 
+    missing: pixels [V, H, W] bool without a value (`completed`).
     leaves: whether matter goes on above and below the frame. Air there would take a soft body away far into the frame,
     for only the bends of its shadow are seen; it may then go on, and ends as smoothly as it can. prior: expected power
     (default: the one that the frames show, or `FIXED` where matter leaves them).
@@ -69,7 +72,7 @@ def bounded_estimate(
     else:
         doubtful = known.noise_of(known.inverse)
     least = (SIGNIFICANT * doubtful)[:, None, None]
-    linear = -sign * filtered(contrast, known.inverse)
+    linear = -sign * filtered(completed(contrast, missing, crop, known), known.inverse)
     inside = torch.zeros_like(linear[:1])
     inside[:, slice(None) if leaves else crop[1], crop[2]] = 1
     phase = linear

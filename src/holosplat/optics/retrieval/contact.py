@@ -57,16 +57,25 @@ def or_in_contact(method: Method) -> Method:
     """`method` for the views that show refraction, and `contact_thickness` for those that show absorption alone."""
 
     @wraps(method)
-    def retrieve(frames: Tensor, exposures: Exposures, delta: float, beta: float, **options: Any) -> Tensor:
+    def retrieve(
+        frames: Tensor,
+        exposures: Exposures,
+        delta: float,
+        beta: float,
+        *,
+        missing: Tensor | None = None,
+        **options: Any,
+    ) -> Tensor:
         exposures = exposures.optical
         checked(frames, exposures, delta)
         alone = absorption_alone(exposures, beta / delta)
         if not alone.any():
-            return method(frames, exposures, delta, beta, **options)
+            return method(frames, exposures, delta, beta, missing=missing, **options)
         found = torch.empty_like(frames)
         found[alone] = contact_thickness(frames[alone], exposures[alone], delta, beta)
         if not alone.all():
-            found[~alone] = method(frames[~alone], exposures[~alone], delta, beta, **options)
+            some = None if missing is None else missing[~alone]
+            found[~alone] = method(frames[~alone], exposures[~alone], delta, beta, missing=some, **options)
         return found
 
     return cast(Method, retrieve)

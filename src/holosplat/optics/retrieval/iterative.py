@@ -17,7 +17,7 @@ from ...scan import Exposures
 from ..propagation import exit_wave_of
 from .contact import or_in_contact
 from .model import DARKEST, WaveModel, view_by_view
-from .spectra import Noise, check_noise
+from .spectra import Gaps, Noise, check_noise
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,7 @@ def gerchberg_saxton(
     beta: float,
     *,
     options: Projections = Projections(),
+    missing: Tensor | None = None,
     on_progress: Advance = lambda fraction: None,
 ) -> Tensor:
     """Thickness [V, H, W] in metres of one material, β of any sign, by alternating projections.
@@ -59,7 +60,7 @@ def gerchberg_saxton(
     def reduce(_: Tensor, projected: Tensor, model: WaveModel) -> Tensor:
         return model.bounded(projected)
 
-    return _alternate(frames, exposures, (delta, beta), options, reduce, on_progress)
+    return _alternate(frames, exposures, (delta, beta), options, reduce, (missing, on_progress))
 
 
 @or_in_contact
@@ -70,6 +71,7 @@ def hybrid_input_output(
     beta: float,
     *,
     options: Projections = Projections(),
+    missing: Tensor | None = None,
     on_progress: Advance = lambda fraction: None,
 ) -> Tensor:
     """Thickness [V, H, W] in metres of one material, β of any sign, by Fienup's (1982) hybrid input–output.
@@ -82,7 +84,7 @@ def hybrid_input_output(
         allowed = (projected >= 0) & (model.support > 0)
         return torch.where(allowed, projected, before - options.feedback * projected)
 
-    return _alternate(frames, exposures, (delta, beta), options, push, on_progress)
+    return _alternate(frames, exposures, (delta, beta), options, push, (missing, on_progress))
 
 
 def _alternate(
@@ -91,19 +93,21 @@ def _alternate(
     material: tuple[float, float],
     options: Projections,
     rule: Callable[[Tensor, Tensor, WaveModel], Tensor],
-    on_progress: Advance,
+    beside: tuple[Gaps, Advance],
 ) -> Tensor:
-    delta, beta = material
+    (delta, beta), (missing, on_progress) = material, beside
 
-    def solve(frames: Tensor, exposures: Exposures, noise: Noise, on_progress: Advance) -> Tensor:
-        model = WaveModel(frames, exposures, beta / delta, noise, options.backend, sign=math.copysign(1.0, delta))
+    def solve(frames: Tensor, exposures: Exposures, noise: Noise, missing: Gaps, on_progress: Advance) -> Tensor:
+        model = WaveModel(
+            frames, exposures, beta / delta, noise, options.backend, sign=math.copysign(1.0, delta), missing=missing
+        )
         phase = model.phase
         for done in range(options.iterations):
             on_progress(done / options.iterations)
             phase = rule(phase, through_detector(model, phase), model)
         return model.thickness(model.bounded(phase), delta)
 
-    return view_by_view(frames, exposures, delta, options.noise, solve, on_progress)
+    return view_by_view(frames, exposures, delta, (options.noise, missing), solve, on_progress)
 
 
 def through_detector(model: WaveModel, phase: Tensor) -> Tensor:
@@ -126,9 +130,11 @@ def through_detector(model: WaveModel, phase: Tensor) -> Tensor:
 
 
 def _gain(model: WaveModel, phase: Tensor) -> Tensor:
-    """Factor [V, H, W] of the amplitude on the waves' raster: measured over modelled pixels, one beyond the frame."""
+    """Factor [V, H, W] of the amplitude on the waves' raster: measured over modelled pixels, one beyond the
+    frame and in missing pixels."""
     (my, mx), s = model.margin, model.oversample
     with torch.no_grad():
         gain = model.amplitude / model.image(phase).clamp_min(DARKEST).sqrt()
+        gain = gain if model.missing is None else gain.masked_fill(model.missing, 1.0)
     gain = pad(gain, (mx, mx, my, my), value=1.0)
     return gain.repeat_interleave(s, 1).repeat_interleave(s, 2)

@@ -24,6 +24,7 @@ from .spectra import (
     check_noise,
     checked,
     column,
+    completed,
     detector_transfer,
     filtered,
     fresnel_phase,
@@ -67,6 +68,7 @@ def paganin(
     beta: float,
     *,
     options: Linear = Linear(),
+    missing: Tensor | None = None,
     on_progress: Advance = lambda fraction: None,
 ) -> Tensor:
     """Thickness [V, H, W] in metres of one material by the filter of Paganin et al. (2002), eq. 12.
@@ -77,7 +79,8 @@ def paganin(
     solved by `contrast_transfer`.
     """
     if beta / delta < WEAKEST_ABSORPTION and options.noise != 0:
-        return contrast_transfer(frames, exposures, delta, beta, options=options, on_progress=on_progress)
+        how = {"options": options, "missing": missing, "on_progress": on_progress}
+        return contrast_transfer(frames, exposures, delta, beta, **how)
     frames = checked(frames, exposures, delta)
     on_progress(0.0)
     if options.noise == 0:
@@ -88,6 +91,7 @@ def paganin(
     ratio = absorption(exposures, beta / delta)
     h = 2 * (ratio + fresnel_phase(exposures, raster)) * detector_transfer(exposures, raster)
     known = spectra(frames, exposures, h, raster, options.noise, options.model_error, options.prior)
+    contrast = completed(contrast, missing, crop, known)
     contact = 1 + 2 * ratio * filtered(contrast, known.inverse)
     mu = column(2 * wavenumber(exposures.energy_kev) * exposures.refraction(delta, beta)[1])
     return (-torch.log(contact.clamp_min(1e-6)) / mu)[crop].to(frames.dtype)
@@ -101,6 +105,7 @@ def contrast_transfer(
     beta: float,
     *,
     options: Linear = Linear(),
+    missing: Tensor | None = None,
     on_progress: Advance = lambda fraction: None,
 ) -> Tensor:
     """Thickness [V, H, W] in metres of one material, β of any sign, by its contrast transfer function.
@@ -115,6 +120,7 @@ def contrast_transfer(
     raster = Raster((contrast.shape[-2], contrast.shape[-1]), exposures.views.pixel_size)
     h = response(exposures, beta / delta, raster)
     known = spectra(frames, exposures, h, raster, options.noise, options.model_error, options.prior)
+    contrast = completed(contrast, missing, crop, known)
     return (-filtered(contrast, known.inverse) * radian(exposures, delta))[crop].to(frames.dtype)
 
 

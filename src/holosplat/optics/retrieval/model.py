@@ -19,6 +19,7 @@ from ..hologram import hologram, optical_path
 from ..sampling import alike, fringe_sampling, padding
 from .bounded import FIXED, MODEL_ERROR, Estimate, bounded_estimate
 from .spectra import (
+    Gaps,
     Noise,
     Prior,
     Raster,
@@ -72,6 +73,7 @@ class WaveModel:
     The raster is the frame padded by the fringes' reach, `oversample` times finer; `support` [V, H, W] marks the
     samples where matter may be: where the estimate has matter, and beyond the frame's border where the estimate touches
     it. float32 frames are computed by `backend`, float64 ones by `reference`. `phase` is the estimate to start from,
+    `missing` [V, h, w] marks pixels without a value, which have no part in the misfit,
     `ratio` the matter's β/δ at the frames' energy, which is one, `sign` that of its δ (-1: holes, which advance waves),
     and `strongest` [V, 1, 1] about the curvature of the strongest frequency: 1 where fringes are seen, and far less
     where hardly any are.
@@ -88,14 +90,16 @@ class WaveModel:
         prior: Prior | None = None,
         *,
         sign: float = 1.0,
+        missing: Gaps = None,
     ) -> None:
-        estimate = bounded_estimate(frames, exposures, ratio, noise, leaves, prior, sign)
+        estimate = bounded_estimate(frames, exposures, ratio, noise, leaves, prior, sign, missing=missing)
         self.sign = sign
         energy = exposures.one_energy("the wave model of a phase retrieval")
         self.exposures, self.ratio = exposures, float(absorption(exposures, ratio)[0])
         self.backend = resolve("reference" if frames.dtype == torch.float64 else backend)
         self.frames = frames.detach().to(device(self.backend))
         self.amplitude = self.frames.clamp_min(0).sqrt()
+        self.missing = None if missing is None else missing.to(self.frames.device)
         self.oversample = fringe_sampling(exposures)
         self.margin = padding(exposures, self.oversample)
         views = exposures.views.padded(self.margin).refined(self.oversample)
@@ -155,6 +159,7 @@ class WaveModel:
         """
         at = phase.detach().requires_grad_()
         difference = self.image(at).clamp_min(DARKEST).sqrt() - self.amplitude
+        difference = difference if self.missing is None else difference.masked_fill(self.missing, 0.0)
         value = 0.5 * difference.double().square().sum(dim=(1, 2))
         (gradient,) = torch.autograd.grad(value.sum(), at)
         return value.detach(), gradient
@@ -182,18 +187,19 @@ def view_by_view(
     frames: Tensor,
     exposures: Exposures,
     delta: float,
-    noise: Noise,
-    solve: Callable[[Tensor, Exposures, Noise, Advance], Tensor],
+    beside: tuple[Noise, Gaps],
+    solve: Callable[[Tensor, Exposures, Noise, Gaps, Advance], Tensor],
     on_progress: Advance,
 ) -> Tensor:
-    """`solve(frames, exposures, noise, on_progress)` of views alike, some at a time, with frames checked."""
-    frames = checked(frames, exposures, delta)
+    """`solve(frames, exposures, noise, missing, on_progress)` of views alike, some at a time, with frames checked;
+    beside: noise and missing pixels."""
+    (noise, missing), frames = beside, checked(frames, exposures, delta)
     found, done = torch.empty_like(frames), 0
     for index in alike(exposures):
         start, share = done / len(exposures), len(index) / len(exposures)
-        part = solve(
-            frames[index], exposures[index], part_of(noise, index), lambda f, a=start, b=share: on_progress(a + b * f)
-        )
+        gaps = None if missing is None else missing[index]
+        told = (exposures[index], part_of(noise, index), gaps)
+        part = solve(frames[index], *told, lambda f, a=start, b=share: on_progress(a + b * f))
         found[index] = part.to(frames.device, frames.dtype)
         done += len(index)
     on_progress(1.0)

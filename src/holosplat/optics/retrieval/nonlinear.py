@@ -13,7 +13,7 @@ from ...ranges import Weight, ranged
 from ...scan import Exposures
 from .contact import or_in_contact
 from .model import Regularised, WaveModel, view_by_view
-from .spectra import TINY, Noise, squared_frequency
+from .spectra import TINY, Gaps, Noise, squared_frequency
 
 FIRST_DAMPING = 0.05
 """Damping at the start; 1 is the curvature of the strongest frequency."""
@@ -40,6 +40,7 @@ def tikhonov(
     beta: float,
     *,
     options: Tikhonov = Tikhonov(),
+    missing: Tensor | None = None,
     on_progress: Advance = lambda fraction: None,
 ) -> Tensor:
     """Thickness [V, H, W] in metres of one material, β of any sign, that agrees with frames [V, H, W].
@@ -53,12 +54,12 @@ def tikhonov(
     refused, and its view is damped more.
     """
 
-    def solve(frames: Tensor, exposures: Exposures, noise: Noise, on_progress: Advance) -> Tensor:
+    def solve(frames: Tensor, exposures: Exposures, noise: Noise, missing: Gaps, on_progress: Advance) -> Tensor:
         how = (options.backend, options.leaves, options.prior)
-        model = WaveModel(frames, exposures, beta / delta, noise, *how, sign=math.copysign(1.0, delta))
+        model = WaveModel(frames, exposures, beta / delta, noise, *how, sign=math.copysign(1.0, delta), missing=missing)
         return model.thickness(descend(model, options, on_progress)[0], delta)
 
-    return view_by_view(frames, exposures, delta, options.noise, solve, on_progress)
+    return view_by_view(frames, exposures, delta, (options.noise, missing), solve, on_progress)
 
 
 def penalty_weights(model: WaveModel, weight: float) -> Tensor:

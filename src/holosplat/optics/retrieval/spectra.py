@@ -64,6 +64,10 @@ def checked(frames: Tensor | np.ndarray, exposures: Exposures, delta: float) -> 
     return frames
 
 
+Gaps = Tensor | None
+"""Pixels without a value, [V, H, W] bool, or None."""
+
+
 def column(values: np.ndarray) -> Tensor:
     """Numbers of views [V] as float64 [V, 1, 1], to go with their images."""
     return torch.from_numpy(np.asarray(values, dtype=np.float64))[:, None, None]
@@ -178,6 +182,40 @@ class Spectra:
     def inverse(self) -> Tensor:
         """Wiener's inverse `H S / (H² S + σ²)` of the response."""
         return self.response * self.power / (self.response.square() * self.power + self.unexplained)
+
+
+FILLINGS = 50
+"""Steps of conjugate gradients in which missing pixels take what the others say of them."""
+
+
+def completed(contrast: Tensor, missing: Gaps, crop: tuple[slice, slice, slice], known: Spectra) -> Tensor:
+    """The contrast [V, H, W] with missing pixels as the likeliest phase of the others predicts them.
+
+    missing: of the frame, which `crop` takes out of the contrast. With K = H W, the response after Wiener's inverse,
+    the values x in the gaps solve `x = P K (c + x)`, P being their projection: expectation and maximisation in one
+    (Dempster et al. 1977). So the pixels have no weight.
+    """
+    if missing is None or not missing.any():
+        return contrast
+    gain, gaps = known.inverse * known.response, torch.zeros_like(contrast)
+    gaps[crop] = missing.to(gaps)
+
+    def explained(images: Tensor) -> Tensor:
+        return gaps * filtered(images, gain)
+
+    def squared(images: Tensor) -> Tensor:
+        return images.square().sum(dim=(1, 2), keepdim=True)
+
+    c = contrast * (1 - gaps)
+    x, left = torch.zeros_like(c), explained(c)
+    way, size = left, squared(left)
+    for _ in range(FILLINGS):
+        slope = way - explained(way)
+        length = size / (way * slope).sum(dim=(1, 2), keepdim=True).clamp_min(TINY)
+        x, left = x + length * way, left - length * slope
+        size, before = squared(left), size
+        way = left + size / before.clamp_min(TINY) * way
+    return c + x
 
 
 def spectra(

@@ -18,7 +18,7 @@ from .triton_cloud import FAINT, Blocks, Records
 FLOATS, INTEGERS, MOMENTS = (tl.constexpr(n) for n in (12, 9, 12))
 """Numbers and integers of a Gaussian, and places for its moments."""
 
-BLOCKS = Blocks(rounds=2)
+BLOCKS = Blocks(rounds=2, large=32768)
 WIDE_FROM = 2**31
 """Voxels of a volume from which places in it are counted in 64 bits."""
 

@@ -18,7 +18,7 @@ from .triton_cloud import FAINT, Blocks, Records
 FLOATS, INTEGERS, MOMENTS = (tl.constexpr(n) for n in (8, 7, 8))
 """Numbers and integers of a record, and places for its moments."""
 
-BLOCKS = Blocks()
+BLOCKS = Blocks(lanes=32)
 WIDE_FROM = 2**31
 """Pixels of an image from which places in it are counted in 64 bits."""
 

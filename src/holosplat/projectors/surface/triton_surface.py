@@ -16,7 +16,9 @@ from torch import Tensor
 DRAWN, DRAWN_WARPS = 32, 1
 """Faces of a program that draws: few, for it goes on until the last of them is done."""
 GATHERED, GATHERED_WARPS = 128, 4
-"""Faces of a program that gathers."""
+"""Faces of a program that gathers what corners get."""
+POSED, POSED_WARPS = 64, 1
+"""Faces of a program that sums for poses."""
 SUMS = tl.constexpr(12)
 """Numbers of a pose: by the rotation, row by row, and by a common motion in the lab frame."""
 
@@ -41,13 +43,11 @@ def shares(points: Tensor, faces: Tensor, gradient: Tensor, weights: Tensor) -> 
 
 def pose_sums(points: Tensor, vertices: Tensor, faces: Tensor, gradient: Tensor) -> Tensor:
     """Sums [V, 12] over all faces, as `SUMS`; vertices [P, 3]: the points in the object frame; all contiguous."""
-    blocks, views = _launch(points, faces, GATHERED)
+    blocks, views = _launch(points, faces, POSED)
     out = points.new_zeros(views, blocks, SUMS.value)
     if gradient.numel() and len(faces):
         sizes = (points.shape[1], len(faces), *gradient.shape[1:])
-        _poses[(blocks, views)](
-            points, vertices, faces, gradient, out, *sizes, GATHERED, num_warps=GATHERED_WARPS
-        )  # fmt: skip
+        _poses[(blocks, views)](points, vertices, faces, gradient, out, *sizes, POSED, num_warps=POSED_WARPS)
     return out.sum(1)
 
 

@@ -3,33 +3,25 @@
 from __future__ import annotations
 
 import math
-import warnings
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
-import scipy.sparse
 import torch
-from scipy.sparse import csr_array, csr_matrix
+from scipy.sparse import csr_array
 from torch import Tensor
 
 from ...backends import device, implementation
 from ...checks import require
 from ...geometry import Grid, Views
 
+Entries = tuple[Tensor, Tensor, Tensor]
+"""Of a CSR matrix: starts of its rows (int64), columns in ascending order (int64), values (float32)."""
 
-def torch_csr(matrix: csr_matrix | csr_array, dtype: torch.dtype) -> Tensor:
-    """The same matrix as a CSR tensor of `dtype`, its columns sorted within each row."""
-    matrix.sort_indices()
-    starts, columns = (torch.from_numpy(a.astype(np.int64)) for a in (matrix.indptr, matrix.indices))
-    with warnings.catch_warnings():  # torch calls its CSR support beta
-        warnings.simplefilter("ignore")
-        values = torch.from_numpy(matrix.data).to(dtype)
-        return torch.sparse_csr_tensor(starts, columns, values, size=matrix.shape, check_invariants=True)
-
-
+BLOCK = 1 << 19
+"""Entries that are made at once, at most."""
 SMALL = 1 << 16
-"""Voxels of a slice times views, at most, of matrices that are kept: about 2 MB each."""
+"""Voxels of a slice times views, at most, of matrices that are kept: a few MB each."""
 KEPT = 16
 """Small matrices that are kept: a run asks for the same ones for its start, its cross-validation and its verdict."""
 
@@ -53,9 +45,15 @@ class SliceProjector:
         nz, ny, nx = grid.shape
         self.array_shape = (nz, nx, ny)
         self._rays = (len(views), views.shape[1])
-        self._products = implementation(f"{__package__}.slice_products", backend).Products(
-            self._entries, (math.prod(self._rays), nz * nx)
-        )
+        make = _kept if nz * nx * len(views) <= SMALL else _Matrix
+        matrix, there = make(_Asked(grid, views.fingerprint(), views)), device(backend)
+
+        def entries(transposed: bool) -> Entries:
+            starts, columns, values = matrix.transposed if transposed else matrix.plain
+            return starts.to(there), columns.to(there), values.to(there)
+
+        products = implementation(f"{__package__}.slice_products", backend).Products
+        self._products = products(entries, (math.prod(self._rays), nz * nx))
 
     def project(self, array: Tensor) -> Tensor:
         """Line integrals [V, W, H] in metres × value of a volume in the order [Z, X, Y]."""
@@ -66,14 +64,6 @@ class SliceProjector:
         """The adjoint of `project`: [V, W, H] → [Z, X, Y]."""
         volume: Tensor = self._products.backproject(lines.reshape(-1, lines.shape[2]))
         return volume.reshape(*self.array_shape[:2], -1)
-
-    def _entries(self, transposed: bool) -> tuple[Tensor, Tensor, Tensor]:
-        """Of the matrix [V·W, Z·X] or its transpose, where the backend computes: starts of rows, columns, values."""
-        nz, _, nx = self.grid.shape
-        made = _kept if nz * nx * len(self.views) <= SMALL else _made
-        matrix = made(_Asked(self.grid, self.views.fingerprint(), transposed, self.views))
-        there = device(self.backend)
-        return matrix.crow_indices().to(there), matrix.col_indices().to(there), matrix.values().to(there)
 
     def volume_in(self, volume: Tensor) -> Tensor:
         """[Z, Y, X] → [Z, X, Y]."""
@@ -90,21 +80,38 @@ class SliceProjector:
 
 @dataclass(frozen=True)
 class _Asked:
-    """Grid and views of a projector, and whether its matrix is transposed; equal to those of the same views."""
+    """Grid and views of a projector; equal to those of the same views."""
 
     grid: Grid
     mark: bytes
-    transposed: bool
     views: Views = field(compare=False)
 
 
-def _made(asked: _Asked) -> Tensor:
-    """The matrix [V·W, Z·X] of a projector, or its transpose, CSR, float32; nobody writes to it."""
-    matrix = slice_matrix(asked.grid, asked.views)
-    return torch_csr(matrix.T.tocsr() if asked.transposed else matrix, torch.float32)
+class _Matrix:
+    """The slice matrix [V·W, Z·X] of a grid and views, and its transpose; nobody writes to their entries."""
+
+    def __init__(self, asked: _Asked) -> None:
+        self._shadows = voxel_shadows(asked.grid, asked.views)
+
+    @cached_property
+    def transposed(self) -> Entries:
+        """The entries of the transpose."""
+        return _entries(self._shadows)
+
+    @cached_property
+    def plain(self) -> Entries:
+        """The entries of the matrix."""
+        return _entries(self._shadows.T.tocsr())
 
 
-_kept = lru_cache(maxsize=KEPT)(_made)
+_kept = lru_cache(maxsize=KEPT)(_Matrix)
+
+
+def _entries(matrix: csr_array) -> Entries:
+    starts, columns = (
+        torch.from_numpy(array.astype(np.int64, copy=False)) for array in (matrix.indptr, matrix.indices)
+    )
+    return starts, columns, torch.from_numpy(matrix.data)
 
 
 def rows_match(grid: Grid, views: Views) -> bool:
@@ -114,39 +121,46 @@ def rows_match(grid: Grid, views: Views) -> bool:
     return grid.shape[1] == views.shape[0] and off < 1e-6 * views.pixel_size
 
 
-def slice_matrix(grid: Grid, views: Views) -> scipy.sparse.csr_matrix:
-    """CSR matrix [V·W, Z·X] of strip integrals [m]: mean over a pixel of the path length through each voxel."""
+def voxel_shadows(grid: Grid, views: Views) -> csr_array:
+    """Transposed slice matrix [Z·X, V·W], CSR, float32: mean over each pixel of the path length [m] through each voxel.
+
+    Views follow one another within each voxel's row, so that nothing has to be sorted.
+    """
     x, _, z = grid.axes()
     dx, _, dz = grid.voxel_size
-    w, p = views.shape[1], views.pixel_size
-    blocks = []
-    for rotation, shift in zip(views.rotations, views.shifts):
-        c, s = rotation[0, 0], rotation[0, 2]
-        centre = (c * x[None, :] + s * z[:, None]).ravel() - shift[0]
-        wide, narrow = sorted((abs(c) * dx, abs(s) * dz), reverse=True)
-        first = np.floor((centre - 0.5 * (wide + narrow)) / p + 0.5 * w).astype(np.int64)
-        rows, columns, data = [], [], []
-        for offset in range(int(np.ceil((wide + narrow) / p)) + 1):
-            pixel = first + offset
-            edge = (pixel - 0.5 * w) * p - centre
-            share = _trapezoid_integral(edge + p, wide, narrow) - _trapezoid_integral(edge, wide, narrow)
-            keep = (share > 1e-12) & (pixel >= 0) & (pixel < w)
-            rows.append(pixel[keep])
-            columns.append(np.flatnonzero(keep))
-            data.append(share[keep] * (dx * dz / p))
-        entries = (np.concatenate(data), (np.concatenate(rows), np.concatenate(columns)))
-        blocks.append(scipy.sparse.csr_matrix(entries, shape=(w, centre.size)))
-    return scipy.sparse.csr_matrix(scipy.sparse.vstack(blocks))
+    (w, p), count = (views.shape[1], views.pixel_size), len(views)
+    cosines, sines = views.rotations[:, 0, 0] / p, views.rotations[:, 0, 2] / p
+    sides = np.sort(np.abs([cosines * dx, sines * dz]), axis=0)
+    most = int(np.ceil(sides.sum(axis=0)).max()) + 1
+    steps, numbers = np.arange(most + 1), list[np.ndarray]()
+    columns, data = list[np.ndarray](), list[np.ndarray]()
+    for part in np.array_split(z, min(len(z), math.ceil(len(z) * len(x) * count * most / BLOCK))):
+        shares = np.empty((len(part) * len(x), count, most), dtype=np.float32)
+        first = np.empty(shares.shape[:2], dtype=np.int64)
+        for v, (narrow, wide) in enumerate(sides.T):
+            centres = (cosines[v] * x + sines[v] * part[:, None]).ravel() + 0.5 * w - views.shifts[v, 0] / p
+            first[:, v] = np.floor(centres - 0.5 * (wide + narrow))
+            within = _trapezoid_integral(first[:, v] + steps[:, None] - centres, wide, narrow)
+            shares[:, v] = np.diff(within, axis=0).T
+        pixels = first[..., None] + steps[:-1]
+        seen = (shares > 1e-12) & (pixels >= 0) & (pixels < w)
+        pixels += w * np.arange(count)[:, None]
+        numbers.append(np.count_nonzero(seen, axis=(1, 2)))
+        columns.append(pixels[seen])
+        data.append(shares[seen] * np.float32(dx * dz / p))
+    starts = np.concatenate([[0], np.cumsum(np.concatenate(numbers))])
+    shape = (len(z) * len(x), count * w)
+    return csr_array((np.concatenate(data), np.concatenate(columns), starts), shape=shape)
 
 
 def _trapezoid_integral(t: np.ndarray, wide: float, narrow: float) -> np.ndarray:
-    """∫_{-∞}^t of the unit-area trapezoid box(wide) * box(narrow)."""
+    """∫_{-∞}^t of the unit-area trapezoid box(wide) * box(narrow); t is overwritten."""
     if narrow < 1e-9 * wide:
         return np.clip(t / wide + 0.5, 0, 1)
-
-    def ramp(u: np.ndarray) -> np.ndarray:
-        return 0.5 * np.clip(u, 0, None) ** 2
-
     a, b = 0.5 * (wide + narrow), 0.5 * (wide - narrow)
-    inside = (ramp(t + a) - ramp(t + b) - ramp(t - b) + ramp(t - a)) / (wide * narrow)
-    return np.where(t >= a, 1.0, inside)
+    inside: np.ndarray = np.square(np.clip(t, -a, a, out=t) + a)
+    for corner in (b, -b):
+        past = np.maximum(t + corner, 0)
+        inside -= np.square(past, out=past)
+    inside /= 2 * wide * narrow
+    return inside

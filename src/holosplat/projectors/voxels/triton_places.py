@@ -7,7 +7,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-BLOCK, WARPS = 256, 4
+BLOCK, WARPS = 256, 8
 """Voxels of a program at a time, and its warps."""
 
 

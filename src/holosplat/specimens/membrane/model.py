@@ -9,9 +9,94 @@ from torch import Tensor
 
 from ...mesh import TriangleMesh
 from ...ranges import ranged
-from . import energies, forces
-from .geometry import corners_of, enclosed_volume, triangle_areas
+from . import energies
+from .energies import deformation_gradient, neo_hookean, strain_invariants
+from .geometry import angle_between, area_vectors, corners_of, cross, enclosed_volume, triangle_areas
 from .rest import RestShape
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """Nodes [..., P, 3] [m], the triangles' corners [..., F, 3, 3] and normals [..., F, 3] (twice the area long)."""
+
+    nodes: Tensor
+    corners: Tensor
+    normals: Tensor
+
+    @classmethod
+    def of(cls, nodes: Tensor, rest: RestShape) -> Shape:
+        """The shared quantities, computed once."""
+        corners = corners_of(nodes, rest.faces)
+        return cls(nodes, corners, area_vectors(corners))
+
+    @property
+    def areas(self) -> Tensor:
+        """[..., F] [m²]."""
+        return 0.5 * self.normals.norm(dim=-1)
+
+
+def stretching_forces(shape: Shape, rest: RestShape, softening: float, linear: float) -> Tensor:
+    """Of the springs: (k κ(λ) + k') (L - L₀) along each edge (Dupin 2007, eq. 18); stiffnesses k, k' [N/m]."""
+    edge = shape.nodes[..., rest.edges[:, 1], :] - shape.nodes[..., rest.edges[:, 0], :]
+    length = edge.norm(dim=-1)
+    stiffness = softening * neo_hookean(length / rest.length) + linear if softening else linear
+    pulls = (stiffness * (length - rest.length) / length).unsqueeze(-1) * edge
+    return _gathered(shape.nodes, rest.edges, torch.stack([pulls, -pulls], dim=-2))
+
+
+def bending_forces(shape: Shape, rest: RestShape, stiffness: float) -> Tensor:
+    """Of the hinges, by the gradient of the dihedral angle (Guckenberger et al. 2016, Comput. Phys. Commun. 207, 1)."""
+    (a, b), (c, d) = (shape.nodes[..., pair, :].unbind(-2) for pair in (rest.edges, rest.opposite))
+    edge = b - a
+    length = edge.norm(dim=-1, keepdim=True)
+    first, second = shape.normals[..., rest.beside, :].unbind(-2)
+    turn = stiffness * (angle_between(edge, first, second) - rest.angle).unsqueeze(-1)
+    first, second = (turn * n / (n**2).sum(-1, keepdim=True) for n in (first, second))
+    on_a = -(((b - c) * edge).sum(-1, keepdim=True) * first + ((b - d) * edge).sum(-1, keepdim=True) * second) / length
+    on_b = -(((c - a) * edge).sum(-1, keepdim=True) * first + ((d - a) * edge).sum(-1, keepdim=True) * second) / length
+    forces = torch.stack([on_a, on_b, length * first, length * second], dim=-2)
+    return _gathered(shape.nodes, torch.cat([rest.edges, rest.opposite], dim=1), forces)
+
+
+def area_forces(shape: Shape, rest: RestShape, local: float, whole: float) -> Tensor:
+    """Of the tension k (A - A₀)/A₀ in each triangle and k (S - S₀)/S₀ in all of them, moduli [N/m]."""
+    areas = shape.areas
+    tension = local * (areas / rest.area - 1)
+    tension = tension + whole * (areas.sum(-1, keepdim=True) / rest.surface - 1)
+    unit = 0.5 * shape.normals / areas.unsqueeze(-1)
+    pull = 0.5 * tension.unsqueeze(-1) * unit
+    a, b, c = shape.corners.unbind(-2)
+    forces = torch.stack([-cross(pull, c - b), -cross(pull, a - c), -cross(pull, b - a)], dim=-2)
+    return _gathered(shape.nodes, rest.faces, forces)
+
+
+def volume_forces(shape: Shape, rest: RestShape, modulus: float) -> Tensor:
+    """Of the pressure -k (V - V₀)/V₀ [N/m²]: a third of each triangle's area vector on each of its corners."""
+    pressure = -modulus * (enclosed_volume(shape.corners) / rest.volume - 1)
+    forces = pressure[..., None, None] * shape.normals / 6
+    return _gathered(shape.nodes, rest.faces, forces.unsqueeze(-2).expand(*forces.shape[:-1], 3, 3))
+
+
+def skalak_forces(shape: Shape, rest: RestShape, shear: float, dilation: float) -> Tensor:
+    """Of Skalak's membrane, -A₀ P B with the stress P = ∂W/∂F and the shape functions' gradients B."""
+    gradient = deformation_gradient(shape.corners, rest)
+    first, second = strain_invariants(gradient)
+    by_first = (0.5 * shear * (first + 1)).unsqueeze(-1)
+    by_second = (0.5 * shear * (dilation * second - 1)).unsqueeze(-1)
+    along, across = gradient.unbind(-1)
+    xx, yy, xy = (p.unsqueeze(-1) for p in ((along**2).sum(-1), (across**2).sum(-1), (along * across).sum(-1)))
+    stress = torch.stack(
+        [2 * (by_first + by_second * yy) * along - 2 * by_second * xy * across,
+         2 * (by_first + by_second * xx) * across - 2 * by_second * xy * along], dim=-1
+    )  # fmt: skip
+    on_b, on_c = (-rest.area[:, None, None] * (stress @ rest.frame.transpose(-1, -2))).unbind(-1)
+    return _gathered(shape.nodes, rest.faces, torch.stack([-on_b - on_c, on_b, on_c], dim=-2))
+
+
+def _gathered(nodes: Tensor, index: Tensor, forces: Tensor) -> Tensor:
+    """The sum [..., P, 3] of `forces` [..., K, n, 3] on the nodes `index` [K, n]."""
+    flat = forces.reshape(*forces.shape[:-3], -1, 3)
+    return torch.zeros_like(nodes).index_add(-2, index.reshape(-1), flat)
 
 
 @dataclass(frozen=True)
@@ -78,18 +163,18 @@ class Membrane:
     def forces(self, nodes: Tensor) -> Tensor:
         """Forces [..., P, 3] [N] on the nodes: minus the energy's gradient, by hand."""
         of, rest = self.elasticity, self.rest
-        shape = forces.Shape.of(nodes, rest)
+        shape = Shape.of(nodes, rest)
         total = torch.zeros_like(nodes)
         if of.springs or of.linear_springs:
-            total = total + forces.stretching_forces(shape, rest, of.springs, of.linear_springs)
+            total = total + stretching_forces(shape, rest, of.springs, of.linear_springs)
         if of.skalak_shear:
-            total = total + forces.skalak_forces(shape, rest, of.skalak_shear, of.skalak_dilation)
+            total = total + skalak_forces(shape, rest, of.skalak_shear, of.skalak_dilation)
         if of.bending:
-            total = total + forces.bending_forces(shape, rest, of.bending)
+            total = total + bending_forces(shape, rest, of.bending)
         if of.local_area or of.global_area:
-            total = total + forces.area_forces(shape, rest, of.local_area, of.global_area)
+            total = total + area_forces(shape, rest, of.local_area, of.global_area)
         if of.volume:
-            total = total + forces.volume_forces(shape, rest, of.volume)
+            total = total + volume_forces(shape, rest, of.volume)
         return total
 
     def surface(self, nodes: Tensor) -> Tensor:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from .deformed_voxels import Deformed
-from .each_time import EachTime, Snapshots, each_time
+from .each_time import EachTime, Snapshots, SpaceTimeFit, SpaceTimeTV, each_time
 from .hexplane_field import HexPlane, LowRank
-from .space_time_tv import SpaceTimeFit, SpaceTimeTV
-from .through_waves import TimesFit
+from .times import TimesFit
 
 __all__ = [
     "Deformed",

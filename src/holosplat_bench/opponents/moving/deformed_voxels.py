@@ -28,8 +28,7 @@ from holosplat.tables import from_table, to_table
 from .each_time import require_times, usual_start
 from .hexplane_field import hats
 from .moving_voxels import OnVoxels, from_plain, held
-from .through_waves import TimesFit, times_fit
-from .times import Cost, DrawnTimes
+from .times import Cost, DrawnTimes, TimesFit, times_fit
 
 NETWORK = "network."
 """Before the names of the weights."""

@@ -25,8 +25,7 @@ from holosplat.tables import from_table, to_table
 
 from .each_time import EachTimeStage, require_times, usual_start
 from .moving_voxels import LowRankVoxels, OnVoxels, VoxelSeries, from_plain, shares
-from .through_waves import TimesFit, times_fit
-from .times import Cost
+from .times import Cost, TimesFit, times_fit
 
 PAIRS = (("xy", "zt"), ("xz", "yt"), ("yz", "xt"))
 """The planes whose features are multiplied: one of space, and one of the third axis and the time."""

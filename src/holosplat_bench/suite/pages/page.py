@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from matplotlib.figure import Figure
+
+from holosplat.io.atomic import atomic_path
 from holosplat.report.page import template
+from holosplat.report.style import DPI, data_uri, styled
 from holosplat.report.tables import Headline
 
 SPECIAL = re.compile(r"([\\`*_<>|\[\]~])")
@@ -30,6 +34,11 @@ class ScoreTable:
     rows: list[tuple[Entry, ...]]
     caption: str = ""
 
+    @classmethod
+    def of(cls, head: Sequence[str], rows: Iterable[Sequence[str]], caption: str = "") -> ScoreTable:
+        """The table of plain texts."""
+        return cls(tuple(head), [tuple(map(Entry, row)) for row in rows], caption)
+
 
 @dataclass(frozen=True)
 class Picture:
@@ -39,6 +48,12 @@ class Picture:
     title: str
     caption: str
     image: str
+
+    @classmethod
+    def of(cls, figure: Figure, path: Path, title: str, caption: str) -> Picture:
+        """A figure, written as the PNG file `path`."""
+        save(figure, path)
+        return cls(path, title, caption, data_uri(figure))
 
 
 @dataclass(frozen=True)
@@ -61,6 +76,21 @@ class Page:
     headline: Headline
     summary: str
     sheets: Sequence[Sheet]
+
+
+@styled
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG, the same bytes for the same figure."""
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=DPI, metadata={"Software": None})
+
+
+def write_page(page: Page, html: Path, markdown: Path) -> tuple[Path, Path]:
+    """Write both files, which lie in the folder of the pictures or above it; returns their paths."""
+    for path, text in ((html, as_html(page)), (markdown, as_markdown(page, markdown.parent))):
+        with atomic_path(path) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+    return html, markdown
 
 
 def as_html(page: Page) -> str:

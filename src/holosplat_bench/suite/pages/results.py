@@ -10,8 +10,7 @@ from typing import Any, Literal
 
 from holosplat.report.style import scientific
 
-from ..folder import BenchFolder
-from ..rows import Row
+from ..folder import BenchFolder, Row
 
 OURS = "gaussians"
 """The method that the others are compared with in the summary."""

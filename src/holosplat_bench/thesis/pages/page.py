@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,26 +11,23 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from holosplat.io.atomic import atomic_path
-from holosplat.report.blocks import Block
 from holosplat.report.content import flatten
-from holosplat.report.page import template
 from holosplat.report.style import (
     CYCLE,
-    DPI,
     FAINT,
     INK,
     WIDTH,
     colour_bar,
-    data_uri,
     decimal_scale,
     letter,
     new_figure,
     scientific,
     styled,
 )
-from holosplat.report.tables import Table, duration
+from holosplat.report.tables import Headline, duration
 
+from ...suite.pages.page import Page, ScoreTable, Sheet, write_page
+from ...suite.pages.page import Picture as Shown
 from ..findings import Finding, findings
 from ..folder import Study
 
@@ -221,68 +218,29 @@ def pictures(study: Study) -> list[Picture]:
     return [picture for picture in PICTURES if study.maps or not picture.mapped]
 
 
-@styled
-def save(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG, the same bytes for the same figure."""
-    figure.savefig(path, format="png", dpi=DPI, metadata={"Software": None})
-
-
 TITLE = "The thesis' study, rerun"
 HEAD = ("configuration", "SSIM", "FRCM", "best FRCM (step)", "PSNR (dB)", "L1")
 HEAD += ("Dice", "δ/β in cells", "δ/β own", "Gaussians", "time")
-FRAMES, VOLUME = (0, 1, 2, 3, 4, 5), (0, 6, 7, 8, 9, 10)
-"""Columns of `HEAD` of the two tables that fit side by side on the page."""
 
 
 def write_study(study: Study, folder: Path) -> list[Path]:
-    """Write thesis.html, thesis.md and the pictures (`figures.PICTURES`) into `folder`; returns their paths."""
+    """Write thesis.html, thesis.md and the pictures (`PICTURES`) into `folder`; returns their paths."""
+    drawn = [Shown.of(one.draw(study), folder / one.file, f"{one.heading}.", one.caption) for one in pictures(study)]
+    texts = write_page(page_of(study, drawn), folder / "thesis.html", folder / "thesis.md")
+    return [*texts, *(one.path for one in drawn)]
+
+
+def page_of(study: Study, drawn: Sequence[Shown] = ()) -> Page:
+    """The page of a study with its pictures."""
     found = findings(study)
-    drawn = {picture: picture.draw(study) for picture in pictures(study)}
-    texts = {"thesis.html": render_study(study, found, drawn), "thesis.md": study_markdown(study, found, list(drawn))}
-    for picture, figure in drawn.items():
-        with atomic_path(folder / picture.file) as temporary:
-            save(figure, temporary)
-    for name, text in texts.items():
-        with atomic_path(folder / name) as temporary:
-            temporary.write_text(text, encoding="utf-8")
-    return [folder / name for name in (*texts, *(picture.file for picture in drawn))]
-
-
-def render_study(study: Study, found: Sequence[Finding], drawn: Mapping[Picture, Figure]) -> str:
-    """The page as HTML, with its figures."""
-    rows = table_rows(study)
-    verdicts = Table("Findings of the thesis", [(f.claim, f.verdict, f.evidence) for f in found], ("", "", "evidence"))
-    frames, volume = (
-        Table(caption, [tuple(row[i] for i in columns) for row in rows], tuple(HEAD[i] for i in columns))
-        for caption, columns in (("Held-out frames, at the end", FRAMES), ("Volume and cost", VOLUME))
+    verdicts = [(f.claim, f.verdict, f.evidence) for f in found]
+    sheets = (
+        Sheet("table", "Table 2", tables=[ScoreTable.of(HEAD, table_rows(study))]),
+        Sheet("findings", "Findings", tables=[ScoreTable.of(("finding", "verdict", "evidence"), verdicts)]),
+        Sheet("figures", "Figures", pictures=drawn),
+        Sheet("record", "Record", tables=[ScoreTable.of(("record", "value"), _records(study))]),
     )
-    blocks = [
-        Block(picture.heading, picture.caption, f"{picture.heading}.", data_uri(figure, "svg"), 100, number)
-        for number, (picture, figure) in enumerate(drawn.items(), 1)
-    ]
-    return template("template.html").render(
-        title=TITLE,
-        summary=summary(study),
-        verdict=verdict(found),
-        key_figures=[],
-        blocks=blocks,
-        scores=[verdicts, frames, volume],
-        records=_records(study),
-    )
-
-
-def study_markdown(study: Study, found: Sequence[Finding], drawn: Sequence[Picture] = ()) -> str:
-    """The page as Markdown, with the pictures beside it."""
-    lines = [f"# {TITLE}", "", verdict(found), "", summary(study), "", "## Table 2", ""]
-    lines += markdown_table(HEAD, table_rows(study))
-    lines += ["", "## Findings", ""]
-    lines += markdown_table(("finding", "verdict", "evidence"), [(f.claim, f.verdict, f.evidence) for f in found])
-    for picture in drawn:
-        lines += ["", f"## {picture.heading}", "", f"![{picture.heading}]({picture.file})", "", picture.caption]
-    lines += ["", "## Record", ""]
-    for table in _records(study):
-        lines += [f"- {table.caption}: " + "; ".join(f"{name} {value}" for name, value in table.rows)]
-    return "\n".join(lines) + "\n"
+    return Page(TITLE, Headline(TITLE, None, (verdict(found),)), summary(study), sheets)
 
 
 def table_rows(study: Study) -> list[tuple[str, ...]]:
@@ -327,20 +285,16 @@ def verdict(found: Sequence[Finding]) -> str:
     return "; ".join(f"“{f.claim}” {f.verdict}" for f in found) + "."
 
 
-def _records(study: Study) -> list[Table]:
+def _records(study: Study) -> list[tuple[str, str]]:
+    """Name and value of what made the study."""
     about = study.about
-    what: list[tuple[str, ...]] = [
+    return [
         ("case", str(about["case"])),
         ("physics", str(about["physics"])),
         ("seed", str(about["seed"])),
         ("schedule", f"{about['pace']['name']} (steps divided by {about['pace']['shortened']})"),
         ("scan", str(about["scan_hash"])),
         ("commit", about["commit"] or "not recorded"),
+        *flatten(about["versions"]).items(),
+        *flatten(about["machine"]).items(),
     ]
-    named = {"Versions": about["versions"], "Machine": about["machine"]}
-    return [Table("Study", what)] + [Table(name, list(flatten(values).items())) for name, values in named.items()]
-
-
-def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """The lines of a table in Markdown."""
-    return ["| " + " | ".join(cells) + " |" for cells in (head, ["---"] * len(head), *rows)]

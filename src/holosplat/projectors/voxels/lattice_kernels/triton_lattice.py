@@ -21,8 +21,10 @@ from torch import Tensor
 from ..triton_places import BLOCK, WARPS, places
 from . import frames
 
-POSE_PROGRAMS = 512
-"""Programs of a view that sum over all voxels, at most."""
+TILE = tl.constexpr(16)
+"""Voxels along x and z of the tiles of `_project`; a block has as many as a tile."""
+POSE_PROGRAMS, POSE_WARPS = 512, 4
+"""Programs of a view that sum over all voxels, at most, and their warps."""
 SLACK, KINK = tl.constexpr(frames.SLACK), tl.constexpr(frames.KINK)
 INTEGER_ARGUMENTS = ["Z", "Y", "X", "H", "W"]
 
@@ -34,8 +36,9 @@ def project(axes: Tensor, volume: Tensor, raster: tuple[int, int]) -> Tensor:
     """
     images = volume.new_zeros(len(axes), *raster)
     if min(raster) > 1:  # else no voxel has all of its hat's pixels
-        grid = (triton.cdiv(volume.numel(), BLOCK), len(axes))
-        _project[grid](axes, volume, images, *volume.shape, *raster, BLOCK, num_warps=WARPS)
+        z, y, x = volume.shape
+        tiles = triton.cdiv(z, TILE.value) * y * triton.cdiv(x, TILE.value)  # at least as many as blocks
+        _project[(tiles, len(axes))](axes, volume, images, z, y, x, *raster, num_warps=WARPS)
     return images
 
 
@@ -58,7 +61,7 @@ def pose_sums(axes: Tensor, volume: Tensor, upstream: Tensor) -> Tensor:
     sums = torch.zeros(len(axes), programs, 2, 4, dtype=torch.float64, device=volume.device)
     if min(raster) > 1:
         sizes, rounds = (*volume.shape, *raster), math.ceil(blocks / programs)
-        _poses[(programs, len(axes))](axes, volume, upstream, sums, *sizes, rounds, BLOCK, num_warps=WARPS)
+        _poses[(programs, len(axes))](axes, volume, upstream, sums, *sizes, rounds, BLOCK, num_warps=POSE_WARPS)
     return sums.sum(1)
 
 
@@ -94,10 +97,18 @@ def _load_four(image, at, W, kept):
 
 
 @triton.jit(do_not_specialize=INTEGER_ARGUMENTS)
-def _project(axes, volume, images, Z, Y, X, H, W, BLOCK: tl.constexpr):
+def _project(axes, volume, images, Z, Y, X, H, W):
+    # Where neighbours along x, one a lane, would all add to one column, lanes are neighbours along z instead.
     v = tl.program_id(1).to(tl.int64)
-    at, z, y, x = places(tl.program_id(0), Y, X, BLOCK)
-    value = tl.load(volume + at, mask=z < Z, other=0.0)
+    if 8 * tl.abs(tl.load(axes + 8 * v + 3)) < tl.abs(tl.load(axes + 8 * v + 1)):
+        across, lane = tl.cdiv(X, TILE), tl.arange(0, TILE * TILE)
+        tile = tl.program_id(0) // across
+        x = tl.program_id(0) % across * TILE + lane // TILE
+        y, z = (tile + tl.zeros_like(lane)) % Y, (tile // Y * TILE + lane % TILE).to(tl.int64)
+        at = (z * Y + y) * X + x
+    else:
+        at, z, y, x = places(tl.program_id(0), Y, X, TILE * TILE)
+    value = tl.load(volume + at, mask=(z < Z) & (x < X), other=0.0)
     column, row = _along(axes + 8 * v, z, y, x), _along(axes + 8 * v + 4, z, y, x)
     kept = (value != 0.0) & _on_raster(column, row, H, W)
     cell, a, b = _cell(column, row, kept, H, W)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 
 import torch
@@ -13,8 +14,10 @@ class Products:
 
     def __init__(self, entries: Callable[[bool], tuple[Tensor, Tensor, Tensor]], shape: tuple[int, int]) -> None:
         """entries: of the matrix, or transposed: starts of rows (int64), columns (int64), values (float32)."""
-        self._forward = torch.sparse_csr_tensor(*entries(False), size=shape, check_invariants=False)
-        self._adjoint = torch.sparse_csr_tensor(*entries(True), size=shape[::-1], check_invariants=False)
+        with warnings.catch_warnings():  # torch calls its CSR support beta
+            warnings.simplefilter("ignore")
+            self._forward = torch.sparse_csr_tensor(*entries(False), size=shape, check_invariants=False)
+            self._adjoint = torch.sparse_csr_tensor(*entries(True), size=shape[::-1], check_invariants=False)
 
     def project(self, volume: Tensor) -> Tensor:
         """Voxels and slices [N, S] → rays and slices [M, S]."""

@@ -1,0 +1,133 @@
+"""Half acquisition: a whole turn with the axis near an edge of the frames, whose opposite frames complete each other.
+
+A frame at θ + 180° is the mirror image of that at θ about the axis. Each frame of the first half turn is joined with
+its opposite one to a frame as wide as what the turn sweeps, so that all that follows sees a usual scan of half a turn.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..checks import note
+from ..frames import Derived, Frames, Taken
+from ..scan import Scan
+from .angles import angles_of, is_half_acquisition
+
+NEAR = 0.5
+"""Pixels by which an opposite frame may show the outermost matter displaced."""
+
+
+@dataclass(frozen=True)
+class Raster:
+    """Columns of wide frames. axis: column of the axis in the files' frames; width: of these."""
+
+    axis: float
+    width: int
+
+    @property
+    def first(self) -> int:
+        """The first wide column, counted as those of the files' frames."""
+        return min(0, math.ceil(self.mirrored_from))
+
+    @property
+    def mirrored_from(self) -> float:
+        """Where the mirror image of a frame begins."""
+        return 2 * self.axis - (self.width - 1)
+
+    @property
+    def columns(self) -> np.ndarray:
+        """[W'] numbers of all wide columns."""
+        return np.arange(self.first, max(self.width - 1, math.floor(2 * self.axis)) + 1)
+
+    @property
+    def reach(self) -> float:
+        """Distance from the axis to the farther edge [pixels]."""
+        return 0.5 * self.width + abs(self.axis - 0.5 * (self.width - 1))
+
+    def weights(self) -> np.ndarray:
+        """[2, W'] of the frame and of the mirrored one: the nearer to its own edge, the less; 0 beyond."""
+        inside = [
+            np.minimum(self.columns - start + 1, start + self.width - self.columns)
+            for start in (0.0, self.mirrored_from)
+        ]
+        known = np.array([np.where(d >= 1 - 1e-9, d, 0.0) for d in inside])
+        return known / known.sum(axis=0)
+
+    def upright(self, frames: np.ndarray) -> np.ndarray:
+        """Frames [K, H, W] on the wide columns, [K, H, W'], zero beyond."""
+        wide = np.zeros((*frames.shape[:2], len(self.columns)), dtype=np.float64)
+        wide[:, :, -self.first : self.width - self.first] = frames
+        return wide
+
+    def mirrored(self, frames: np.ndarray) -> np.ndarray:
+        """Mirror images about the axis of frames [K, H, W] on the wide columns, by cubic splines between pixels."""
+        from scipy.ndimage import shift  # which takes long to load
+
+        start = math.ceil(self.mirrored_from - 1e-9)
+        turned, between = frames[:, :, ::-1].astype(np.float64), start - self.mirrored_from
+        turned = turned if abs(between) < 1e-9 else shift(turned, (0, 0, -between), order=3, mode="nearest")
+        wide, place = np.zeros((*frames.shape[:2], len(self.columns))), start - self.first
+        count = min(self.width, len(self.columns) - place)
+        wide[:, :, place : place + count] = turned[:, :, :count]
+        return wide
+
+
+class Stitched(Derived):
+    """Wide frames of those at `ones` [n] and the opposite ones at `others` [n]."""
+
+    def __init__(
+        self, frames: np.ndarray | Frames, missing: np.ndarray | None, pairs: np.ndarray, raster: Raster
+    ) -> None:
+        self._frames, self._missing, self._pairs, self._raster = frames, missing, pairs, raster
+        self.shape = (len(pairs), frames.shape[1], len(raster.columns))
+
+    def with_missing(self, numbers: np.ndarray) -> Taken:
+        """See `Frames.with_missing`."""
+        total, weight = np.zeros((2, len(numbers), *self.shape[1:]))
+        ways = (self._raster.upright, self._raster.mirrored)
+        for which, place, share in zip(self._pairs[numbers].T, ways, self._raster.weights()):
+            frames, missing = self._taken(which)
+            known = share if missing is None else share * (place(missing.astype(np.float32)) < 0.5)
+            total += place(frames) * known
+            weight += known
+        none = weight == 0
+        found = (total / np.where(none, 1, weight)).astype(np.float32)
+        if not none.any():
+            return found, None
+        from .stored_frames import filled  # which reads files
+
+        return filled("the stitched frames", found, np.zeros(none.shape, dtype=bool), none, numbers)
+
+    def _taken(self, numbers: np.ndarray) -> Taken:
+        if isinstance(self._frames, Frames):
+            return self._frames.with_missing(numbers)
+        return self._frames[numbers], None if self._missing is None else self._missing[numbers]
+
+
+def stitched(scan: Scan) -> Scan:
+    """The scan of half a turn on frames as wide as what the turn sweeps, if it is a half acquisition whose frames all
+    have opposite ones, which is said; else the scan as it is."""
+    if not is_half_acquisition(scan):
+        return scan
+    views, angles = scan.views, angles_of(scan.views)
+    assert angles is not None
+    raster = Raster(0.5 * (views.shape[1] - 1) - float(views.shifts[0, 0]) / views.pixel_size, views.shape[1])
+    first = np.flatnonzero((angles - angles[0] + 1e-6) % 360 < 180)
+    away = np.abs((angles[first, None] + 180 - angles[None] + 180) % 360 - 180)
+    pairs = np.stack([first, away.argmin(axis=1)], axis=1)
+    if math.radians(float(away.min(axis=1).max())) * raster.reach > NEAR:
+        return scan
+    frames = Stitched(scan.source, None if isinstance(scan.source, Frames) else scan.missing, pairs, raster)
+    columns, exposures = raster.columns, scan.exposures[first]
+    shifts = exposures.views.shifts.copy()
+    shifts[:, 0] = (raster.first - raster.axis - 0.5 + 0.5 * len(columns)) * views.pixel_size
+    wide = replace(exposures.views, shifts=shifts, shape=(views.shape[0], len(columns)))
+    note(
+        f"half acquisition: {len(scan)} frames of {views.shape[1]} columns with the axis at column {raster.axis:.4g} "
+        f"are joined, each with the opposite one, to {len(first)} frames of {len(columns)} columns"
+    )
+    held_out = scan.is_test[pairs[:, 0]] | scan.is_test[pairs[:, 1]]
+    return Scan.of(frames, replace(exposures, views=wide), held_out, scan.provenance | {"stitched": "opposite frames"})
