@@ -22,7 +22,6 @@ import argparse
 import math
 import os
 import time
-from contextlib import suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -88,18 +87,15 @@ class Scene:
     shock: bool
 
     def told(self, how: str) -> hs.MaterialPrior:
-        """What a run is told: the materials against their medium, or the ratio of a shock's medium, or nothing.
-
-        Of two materials that no prior takes, as red cells in plasma against glass, it is told the first.
-        """
+        """What a run is told: the materials against their medium, or the ratio of a shock's medium, or nothing; the
+        textbook the first of the materials."""
         if how == "nothing told":
             return hs.MaterialPrior.unknown()
         if self.shock:
             return hs.MaterialPrior.of_ratio(self.substances.medium.ratio)
         core, first = self.substances.core, self.substances.contrast
         if how == "told" and core is not None:
-            with suppress(hs.InputError):  # of two whose δ are nearly equal
-                return hs.MaterialPrior.known(first, core.against(self.substances.medium))
+            return hs.MaterialPrior.known(first, core.against(self.substances.medium))
         return hs.MaterialPrior.known(first)
 
 

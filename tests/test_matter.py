@@ -45,13 +45,23 @@ def test_what_is_told_of_the_sign_is_known():
     assert prior_of(MaterialPrior.known(DeltaBeta(-1e-7, 0.0), medium="oil").as_dict()).medium == "oil"
 
 
+def test_several_materials_are_the_same_in_a_file():
+    first, near, last = DeltaBeta(9e-7, 2e-9), DeltaBeta(8.6e-7, 1e-9), DeltaBeta(2e-7, 1e-10)
+    several = MaterialPrior.known(last, near, first)
+    assert several.materials == (first, near, last)
+    assert prior_of(several.as_dict()) == several
+    old = {"kind": "known", "delta": first.delta, "beta": first.beta}
+    old |= {"second_delta": last.delta, "second_beta": last.beta}
+    assert prior_of(old).materials == (first, last)
+
+
 def test_what_cannot_be_seen_or_told_apart_is_refused():
     with pytest.raises(InputError, match="must differ from its medium in δ, but the difference is 0"):
         MaterialPrior.known(DeltaBeta(0.0, 1e-9))
-    with pytest.raises(InputError, match="both have δ above their medium's, or both below"):
+    with pytest.raises(InputError, match="must all have δ above their medium's, or all below"):
         MaterialPrior.known(SOFT, DeltaBeta(-5e-7, -5e-9))
-    with pytest.raises(InputError, match=r"at least 1\.6 times the other's"):
-        MaterialPrior.known(DeltaBeta(-1e-7, 0.0), DeltaBeta(-1.1e-7, 0.0))
+    with pytest.raises(InputError, match="told apart by δ, but theirs are"):
+        MaterialPrior.known(DeltaBeta(-1e-7, 0.0), DeltaBeta(-1e-7, -1e-9))
     with pytest.raises(InputError, match="sign must be -1, 0 or 1"):
         prior_of(MaterialPrior.unknown().as_dict() | {"sign": 2})
 

@@ -283,6 +283,11 @@ def parse_material(text: str, density_g_cm3: float | None = None) -> Material:
     return Compound(name, density_g_cm3)  # type: ignore[arg-type]
 
 
+def is_named(text: str) -> bool:
+    """Whether `text` is the name of a material (`named_materials`), which has its density, and not a formula."""
+    return text.strip().lower().replace("_", " ") in _by_name()
+
+
 def read_material_table(path: str | Path) -> dict[str, Material]:
     """Materials per mesh file, from a JSON or TOML file: {file-name pattern: material}, in the file's order.
 

@@ -18,7 +18,7 @@ Sign = Literal[-1, 0, 1]
 MatterKind = Literal["levels", "continuous"]
 """What matter is like: of one level of δ, or several, with sharp edges, or varying smoothly."""
 LEAST_CONTRAST = 1.6
-"""Two materials whose δ differ by less than this factor pass for one."""
+"""Two levels that are found, and not known, pass for one where they differ by less than this factor."""
 MOST_DELTA = 10.0
 """What no δ or β of X-rays comes near: those of gold at 1 keV are 0.002."""
 RATIO_RANGE = (1.0, 1e6)
@@ -61,9 +61,9 @@ class DeltaBeta(NamedTuple):
 class Matter:
     """What the channels of a model's values mean.
 
-    channels: (δ, β) of a value of one, for each of one or two channels
+    channels: (δ, β) of a value of one, for each channel
     occupancies: True if values are shares of materials, which cannot add up to more than one; False if δ and β are
-        free, each in its own channel
+        free, each in its own of two channels
     """
 
     channels: tuple[DeltaBeta, ...]
@@ -71,7 +71,11 @@ class Matter:
 
     def __post_init__(self) -> None:
         channels = tuple(DeltaBeta(float(delta), float(beta)) for delta, beta in self.channels)
-        require(len(channels) in (1, 2), f"matter must have one or two channels, but it has {len(channels)}.")
+        require(len(channels) > 0, "matter must have a channel at least, but it has none.")
+        require(
+            self.occupancies or len(channels) == 2,
+            f"free δ and β have a channel each, but matter has {len(channels)} channels.",
+        )
         for name, value in ((name, value) for channel in channels for name, value in zip(("δ", "β"), channel)):
             require(
                 abs(value) <= MOST_DELTA,
@@ -85,9 +89,9 @@ class Matter:
         return cls((DeltaBeta(delta, beta),))
 
     @classmethod
-    def two(cls, denser: tuple[float, float], lighter: tuple[float, float]) -> Matter:
-        """Two materials, (δ, β) each; the values are their occupancies."""
-        return cls((DeltaBeta(*denser), DeltaBeta(*lighter)))
+    def several(cls, *materials: tuple[float, float]) -> Matter:
+        """Materials, (δ, β) each; the values are their occupancies."""
+        return cls(tuple(DeltaBeta(*each) for each in materials))
 
     @classmethod
     def free(cls, delta: float, beta: float) -> Matter:
@@ -104,9 +108,9 @@ class Matter:
         return len(self.channels) == 1
 
     @property
-    def second(self) -> DeltaBeta | None:
-        """The lighter of two materials; None where there is one, or none is told apart."""
-        return self.channels[1] if self.occupancies and len(self.channels) == 2 else None
+    def others(self) -> tuple[DeltaBeta, ...]:
+        """The materials after the first, of weaker contrast; none where there is one, or none is told apart."""
+        return self.channels[1:] if self.occupancies else ()
 
     @property
     def delta(self) -> float:
@@ -149,9 +153,9 @@ class Matter:
 class MaterialPrior:
     """The knowledge of the material before a reconstruction: δ and β, their ratio, or nothing.
 
-    Made by `known`, `of_ratio` or `unknown`, which return `Known` or `KnownTwo`, `KnownRatio`, or `Unknown`. δ and β
-    are differences from the medium around the object. Errors: `InputError` for `MaterialPrior()` itself, for a δ that
-    is not above zero, and for a ratio whose size is not from 1 to 10⁶.
+    Made by `known`, `of_ratio` or `unknown`: `Known` or `KnownSeveral`, `KnownRatio`, or `Unknown`. δ and β are
+    differences from the medium around the object. Errors: `InputError` for `MaterialPrior()` itself, for a δ of zero,
+    and for a ratio whose size is not from 1 to 10⁶.
 
     Examples:
 
@@ -183,15 +187,15 @@ class MaterialPrior:
         return super().__new__(cls)
 
     @staticmethod
-    def known(material: DeltaBeta, second: DeltaBeta | None = None, medium: str = "") -> MaterialPrior:
-        """δ (not zero) and β of one material, or of two whose δ differ, are known; below zero for holes in a medium.
+    def known(material: DeltaBeta, *others: DeltaBeta, medium: str = "") -> MaterialPrior:
+        """δ (not zero) and β of one material, or of several whose δ differ; below zero for holes in a medium.
 
         medium: its name, for what is said; empty: vacuum, or not said.
         """
-        if second is None:
+        if not others:
             return Known(DeltaBeta(*material), medium)
-        denser, lighter = sorted((material, second), key=lambda one: (abs(one[0]), one), reverse=True)
-        return KnownTwo(DeltaBeta(*denser), DeltaBeta(*lighter), medium)
+        by_size = sorted((material, *others), key=lambda one: (abs(one[0]), one), reverse=True)
+        return KnownSeveral(tuple(DeltaBeta(*one) for one in by_size), medium)
 
     @staticmethod
     def of_ratio(ratio: float, sign: Sign = 0) -> MaterialPrior:
@@ -263,43 +267,36 @@ class Known(MaterialPrior):
 
 
 @dataclass(frozen=True)
-class KnownTwo(MaterialPrior):
-    """Two materials of known δ and β, both against their medium."""
+class KnownSeveral(MaterialPrior):
+    """Materials of known δ and β, all against their medium, that of the larger |δ| first."""
 
-    denser: DeltaBeta
-    lighter: DeltaBeta
+    materials: tuple[DeltaBeta, ...]  # type: ignore[override]
     medium: str = field(default="", compare=False)
     kind = "known"
 
     def __post_init__(self) -> None:
-        for material in (self.denser, self.lighter):
+        for material in self.materials:
             _require_contrast(material)
+        deltas = [material.delta for material in self.materials]
+        listed = ", ".join(f"{delta:.3g}" for delta in deltas)
         require(
-            self.denser.sign == self.lighter.sign,
-            "two materials must both have δ above their medium's, or both below, but the differences are "
-            f"{self.denser.delta:.3g} and {self.lighter.delta:.3g}; give the medium that lies on one side of both, or "
-            "one material.",
+            min(deltas) * max(deltas) > 0,
+            "materials must all have δ above their medium's, or all below, but the differences are "
+            f"{listed}; give the medium that lies on one side of all, or fewer materials.",
         )
         require(
-            abs(self.denser.delta) >= LEAST_CONTRAST * abs(self.lighter.delta),
-            f"two materials are told apart by δ, of which one must have at least {LEAST_CONTRAST:g} times the other's, "
-            f"but they have {self.denser.delta:.3g} and {self.lighter.delta:.3g}; take them for one.",
+            len(set(deltas)) == len(deltas),
+            f"materials are told apart by δ, but theirs are {listed}; take those that are alike for one.",
         )
-
-    @property
-    def materials(self) -> tuple[DeltaBeta, ...]:  # type: ignore[override]
-        """The two materials, that of the larger |δ| first."""
-        return (self.denser, self.lighter)
 
     @property
     def sign(self) -> Sign:  # type: ignore[override]
-        """That of δ of both."""
-        return -1 if self.denser.delta < 0 else 1
+        """That of δ of all."""
+        return -1 if self.materials[0].delta < 0 else 1
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, ready for JSON."""
-        lighter = {"second_delta": self.lighter.delta, "second_beta": self.lighter.beta}
-        return super().as_dict() | {name: value for name, value in lighter.items() if value}
+        return super().as_dict() | {"others": [list(other) for other in self.materials[1:]]}
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,7 @@ class Volume:
 class LineIntegrals:
     """Line integrals along the beam by channels of matter; unpacks to `(B, D)`, of β and δ, each [V, H, W] in metres.
 
-    channels: [V, C, H, W], C = 1 or 2.
+    channels: [V, C, H, W].
     materials: for each channel, the (δ, β) [m] that a unit of it integrates to: `D = Σ δ_c T_c`, `B = Σ β_c T_c`.
     """
 

@@ -27,7 +27,7 @@ from holosplat.methods.presets import preset
 from holosplat.methods.start import starting_cloud
 from holosplat.methods.surface_fit import extract_surfaces
 from holosplat.model import Instrument, measure
-from holosplat.representations import GaussianCloud, VoxelLines, approximate, cloud_from_two
+from holosplat.representations import GaussianCloud, VoxelLines, approximate, cloud_from_shares
 from holosplat.representations.gaussians import raw_of
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.capsules import place_capsules
@@ -180,7 +180,7 @@ def two_clouds() -> tuple[GaussianCloud, GaussianCloud, GaussianCloud]:
         GaussianCloud((centres, *shapes, raw_of(amplitudes[:, [c]])), PIXEL, Matter.one(*material))
         for c, material in enumerate(BOTH)
     )
-    return GaussianCloud((centres, *shapes, raw_of(amplitudes)), PIXEL, Matter.two(SILICA, OIL)), one, other
+    return GaussianCloud((centres, *shapes, raw_of(amplitudes)), PIXEL, Matter.several(SILICA, OIL)), one, other
 
 
 def test_a_cloud_of_two_materials_is_the_sum_of_two_clouds():
@@ -200,7 +200,7 @@ def test_a_cloud_of_two_materials_keeps_them(tmp_path):
     assert both.matter.occupancies
     assert not both.matter.single
     assert both.matter.channels == (SILICA, OIL)
-    assert both.detached().on("reference").matter.second == OIL
+    assert both.detached().on("reference").matter.others == (OIL,)
     write_object(tmp_path / "object.h5", both)
     found = read_object(tmp_path / "object.h5")
     assert isinstance(found, GaussianCloud)
@@ -210,7 +210,7 @@ def test_a_cloud_of_two_materials_keeps_them(tmp_path):
 
 
 def test_gaussians_of_two_start_as_one_or_the_other(shares, grid):
-    cloud = cloud_from_two(shares.values, grid, BOTH, PIXEL, PIXEL)
+    cloud = cloud_from_shares(shares.values, grid, BOTH, PIXEL, PIXEL)
     amplitudes = cloud.amplitudes
     assert bool(((amplitudes < 2e-4).sum(dim=1) == 1).all())
     learnt = approximate(cloud, shares.values, grid, 20, lambda stage, fraction: None)
@@ -221,8 +221,8 @@ def test_gaussians_of_two_start_as_one_or_the_other(shares, grid):
 
 def test_a_material_that_is_not_there_is_named(shares, grid):
     alone = torch.stack([shares.values[0], torch.zeros(grid.shape)])
-    with pytest.raises(InputError, match="nothing of the lighter"):
-        cloud_from_two(alone, grid, BOTH, PIXEL, PIXEL)
+    with pytest.raises(InputError, match="nothing of the material of δ"):
+        cloud_from_shares(alone, grid, BOTH, PIXEL, PIXEL)
 
 
 def test_occupancies_of_two_are_bounded_together():
@@ -245,9 +245,9 @@ def test_the_denser_of_two_known_materials_comes_first():
 
 
 def test_materials_that_delta_does_not_tell_apart_are_refused():
-    with pytest.raises(InputError, match="told apart"):
-        MaterialPrior.known(SILICA, DeltaBeta(0.8 * SILICA.delta, 0.0))
-    with pytest.raises(InputError, match="both have δ above"):
+    with pytest.raises(InputError, match="told apart by δ, but theirs are"):
+        MaterialPrior.known(SILICA, DeltaBeta(SILICA.delta, 0.0))
+    with pytest.raises(InputError, match="must all have δ above"):
         MaterialPrior.known(SILICA, DeltaBeta(-1e-7, 0.0))
 
 
@@ -268,16 +268,16 @@ def settings(refine: int = 0) -> Gaussians:
 def test_two_materials_are_found_where_nothing_is_known(scan, truth):
     """δ is right; β of the dense one is known to its order of magnitude only."""
     found = reconstruct(scan, MaterialPrior.unknown(), settings())
-    assert found.object.matter.second is not None
+    assert found.object.matter.others
     (high, dark), (low, _) = found.object.matter.channels
     assert high == pytest.approx(SILICA.delta, rel=0.05)
     assert low == pytest.approx(OIL.delta, rel=0.25)
     assert 0.2 * SILICA.beta < dark < 1.35 * SILICA.beta
     scores = evaluate(found, scan, truth)
     assert scores.volume.relative_error_delta < 0.16
-    assert "of two; the other: δ " in scores.lines()[-1]
+    assert "of 2; beside: δ " in scores.lines()[-1]
     assert "inf" not in scores.lines()[-1]
-    assert scores.as_dict()["material"]["second"]["delta"] == pytest.approx(low)
+    assert scores.as_dict()["material"]["others"][0]["delta"] == pytest.approx(low)
 
 
 def test_two_known_materials_are_taken_as_they_are(scan, truth):
@@ -290,7 +290,7 @@ def test_two_known_materials_are_taken_as_they_are(scan, truth):
 
 def test_delta_and_beta_apart_are_still_to_be_had(scan):
     cloud = starting_cloud(Task(scan.train(), MaterialPrior.unknown()), replace(settings(), separate=True))
-    assert cloud.matter.second is None
+    assert not cloud.matter.others
     assert not cloud.matter.occupancies
 
 
@@ -329,7 +329,7 @@ def test_a_run_of_two_materials_is_resumed_as_one(scan, tmp_path):
     assert found.matter.channels == BOTH
     for name, p in expected.parameters().items():
         torch.testing.assert_close(found.parameters()[name], p, rtol=0, atol=0)
-    assert read_json(parts.summary)["second_material"] == {"delta": OIL.delta, "beta": OIL.beta}
+    assert read_json(parts.summary)["other_materials"] == [{"delta": OIL.delta, "beta": OIL.beta}]
 
 
 def test_the_plain_path_needs_no_kernels(scan, monkeypatch):
@@ -345,7 +345,7 @@ def test_the_plain_path_needs_no_kernels(scan, monkeypatch):
 
 def test_surfaces_of_two_materials_are_refused(scan, tmp_path):
     cloud = starting_cloud(Task(scan.train(), PRIOR), QUICK)
-    with pytest.raises(InputError, match="has two materials"):
+    with pytest.raises(InputError, match="has several materials"):
         extract_surfaces(cloud, scan)
 
 
@@ -365,23 +365,23 @@ def test_frames_of_a_cloud_of_two_go_through_the_same_optics(scan):
 def test_two_materials_are_named_on_the_command_line(scan, tmp_path):
     write_scan(tmp_path / "scan.nxs", scan)
     run = tmp_path / "run"
-    named = ("--material", "SiO2", "--density", 2.2, "--second-material", "C16H34", "--second-density", 0.77)
+    named = ("--material", "SiO2", "--density", 2.2, "--material", "C16H34", "--density", 0.77)
     few = ("volume.iterations=40", "volume.corrections=1", "approximate_steps=5", "fit.schedule.steps=6")
     quick = ("--preset", "fast", *(word for change in few for word in ("--set", change)))
     worked(holosplat("reconstruct", tmp_path / "scan.nxs", *named, *quick, "--out", run))
     assert read_object(run / "object.h5").matter.channels == pytest.approx(np.array(BOTH), rel=1e-6)
     shown = worked(holosplat("evaluate", run))
-    assert "of two" in shown.out
-    refused(holosplat("surface", run, "--out", tmp_path / "surfaces"), "two materials")
+    assert "of 2" in shown.out
+    refused(holosplat("surface", run, "--out", tmp_path / "surfaces"), "several materials")
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (("--second-material", "water"), "--second-material can only go with --material"),
-        (("--delta-beta", 300, "--second-material", "water"), "--second-material can only go with --material"),
-        (("--material", "water", "--second-density", 1.1), "--second-density needs --second-material"),
-        (("--material", "water", "--second-material", "red cell"), "told apart"),
+        (("--density", 1.1), "--density can only go with --material"),
+        (("--delta-beta", 300, "--material", "water"), "give --material or --delta-beta, not both"),
+        (("--material", "SiO2", *(3 * ("--density", 1.1))), "for each formula (1), but it is given 3"),
+        (("--material", "water", "--material", "water"), "told apart"),
     ],
 )
 def test_what_does_not_go_together_is_refused(scan, tmp_path, options, words):
@@ -393,6 +393,6 @@ def test_what_does_not_go_together_is_refused(scan, tmp_path, options, words):
 
 def test_one_material_is_enough_to_convert(scan, tmp_path):
     write_scan(tmp_path / "scan.nxs", scan)
-    named = ("--material", "SiO2", "--density", 2.2, "--second-material", "water")
+    named = ("--material", "SiO2", "--density", 2.2, "--material", "water")
     command = ("convert", tmp_path / "scan.nxs", tmp_path / "out", "--to", "r2-gaussian", *named)
     refused(holosplat(*command), "one material")

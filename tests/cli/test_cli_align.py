@@ -83,7 +83,7 @@ def test_a_run_refines_its_geometry_and_keeps_it(shop, tmp_path):
     refine = PoseOptions(PosePrior(angle=0.0, roll=0.0))
     options = {"matter": "levels", "refine": refine, "folder": RunFolder(run), "resume": True}
     again = hs.reconstruct(
-        planned, PriorOptions("haemoglobin").prior(planned.exposures.reference_energy), QUICK, 5, **options
+        planned, PriorOptions(("haemoglobin",)).prior(planned.exposures.reference_energy), QUICK, 5, **options
     )
     np.testing.assert_array_equal(again.placed(planned).views.shifts, found)
     refused(holosplat("reconstruct", path, "--out", run, *known(shop), "--seed", 5, "--resume"), "refinement")

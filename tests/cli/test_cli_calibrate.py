@@ -24,7 +24,7 @@ PLACES = np.array([[6.0, -5.0, 1.0], [-5.0, 4.0, 3.0], [0.0, 6.0, -6.0]])
 @pytest.fixture(scope="module")
 def scan(tmp_path_factory):
     """Three beads of polystyrene; the first view is shifted by a pixel, and the file does not know."""
-    material = PriorOptions("polystyrene").prior(20.0).materials[0]
+    material = PriorOptions(("polystyrene",)).prior(20.0).materials[0]
     vertices, faces = icosphere(3)
     beads = [hs.mesh.TriangleMesh(PIXEL * (3.0 * vertices + place), faces) for place in PLACES]
     views = hs.Views.from_rotations(rotation_y([0.0, 40.0, 95.0]), SHAPE, PIXEL)

@@ -13,7 +13,7 @@ from holosplat.cli import motion
 from holosplat.io.nxtomo import read_scan
 from holosplat.io.reading import Reading
 from holosplat.io.volumes import read_volume
-from holosplat.matter import DeltaBeta, KnownTwo
+from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import SmoothVolume
 from holosplat.motion.flow_reconstruction import FlowOptions, FlowSearch
 from holosplat.optics.background import LightOptions
@@ -114,15 +114,15 @@ def test_matter_may_fade(quick):
 
 def test_two_materials_in_motion_are_refused_or_said_to_be_left(quick, capsys):
     """Bodies are refused in one sentence; continuous matter is taken as of one time, and not said to stand still."""
-    two = ["--material", "PMMA", "--second-material", "alumina"]
+    two = ["--material", "PMMA", "--material", "alumina"]
     refused = holosplat("track", quick / "s.nxs", *two, "--out", quick / "none")
     assert refused.code == 2
-    assert "bodies are of one material, but two are known; leave --second-material." in refused.err
-    prior = KnownTwo(DeltaBeta(8e-7, 8e-10), DeltaBeta(4e-7, 3e-10))
+    assert "bodies are of one material, but several are known; give --material once." in refused.err
+    prior = MaterialPrior.known(DeltaBeta(8e-7, 8e-10), DeltaBeta(4e-7, 3e-10))
     how = (0, LightOptions(), QUICK)
     assert not motion.reconstruct_in_motion(quick / "s.nxs", Reading(), prior, RunFolder(quick / "none"), how)
     said = capsys.readouterr().err
-    assert "a flow carries one material, but two are known" in said
+    assert "a flow carries one material, but several are known" in said
     assert "nothing moves" not in said
     assert not (quick / "none").exists()
 

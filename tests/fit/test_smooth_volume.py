@@ -38,11 +38,16 @@ def plain(u: torch.Tensor, prior: ContinuousPrior) -> torch.Tensor:
     square[:, :, :-1] += (u[:, :, 1:] - u[:, :, :-1]) ** 2
     size = torch.sqrt(square + prior.rounding**2) - prior.rounding
     slopes = prior.slopes * torch.log(1 + size / prior.slope).sum()
-    return slopes + prior.values * torch.log(1 + u / prior.value).sum()
+    away = u
+    if prior.levels:
+        nearest = torch.stack([(u - level) ** 2 for level in (0.0, *prior.levels)]).min(dim=0).values
+        away = torch.sqrt(nearest + prior.rounding**2) - prior.rounding
+    return slopes + prior.values * torch.log(1 + away / prior.value).sum()
 
 
-def test_the_prior_is_its_plain_form():
-    weighty = ContinuousPrior(slopes=3.0, values=0.7)
+@pytest.mark.parametrize("levels", [(), (1.0,), (0.4, 1.0)])
+def test_the_prior_is_its_plain_form(levels):
+    weighty = ContinuousPrior(slopes=3.0, values=0.7, levels=levels)
     u = matter() + 0.1 * torch.rand(matter().shape, generator=torch.Generator().manual_seed(1))
     at = u.double().requires_grad_()
     expected = plain(at, weighty)
@@ -86,6 +91,17 @@ def test_an_empty_volume_is_a_trap_that_shorter_steps_avoid(kept, end):
         descent.step()
     assert descent.u.numpy() == pytest.approx(end, abs=1e-3)
     assert Descent.again(Trap(), descent.state_dict()).kept is kept
+
+
+def test_a_known_level_draws_matter_that_is_near_to_it():
+    """Where frames tell next to nothing, what is known decides; without it the matter vanishes."""
+    blind = NoiseModel.white_only(torch.full((6,), 1e3, dtype=torch.float64), SHAPE)
+    full = (matter() > 0.5).float()
+    for levels, end in (((1.0,), 1.0), ((), 0.0)):
+        prior = ContinuousPrior(slopes=0.01, values=1.0, levels=levels)
+        p = VolumeProblem(WhitenedFrames(blob_scan(), MATERIAL, blind), prior, 1.0)
+        found, _ = descend(p, 0.9 * full, 20)
+        assert float(found[full > 0].median()) == pytest.approx(end, abs=0.03)
 
 
 def test_bad_options_are_refused():

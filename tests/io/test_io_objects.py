@@ -68,7 +68,7 @@ def objects() -> dict[str, Stored]:
     return {
         "gaussians": free,
         "moving-gaussians": MovingGaussians(free, flow, torch.randn(2, n)),
-        "voxels": VoxelGrid(torch.rand(2, *GRID.shape), GRID, Matter.two((3e-7, 2e-10), (1e-7, 1e-11))),
+        "voxels": VoxelGrid(torch.rand(2, *GRID.shape), GRID, Matter.several((3e-7, 2e-10), (1e-7, 1e-11))),
         "surfaces": SurfaceMesh(3 * sphere, faces.long(), PITCH, CELL, 3),
         "moving-surfaces": MovingSurfaces(
             torch.stack([3 * sphere, 3 * sphere + 1]), faces.long(), 0 * faces[:, 0], TimeBasis(0, 1e-5, 1), PITCH, CELL
@@ -355,4 +355,4 @@ def test_two_materials_and_free_channels_of_version_0_1(tmp_path):
     assert read_gaussians(path).matter == Matter.free(delta, beta)
     with h5py.File(path, "r+") as file:
         file.attrs["second"] = [1e-7, 1e-11]
-    assert read_gaussians(path).matter == Matter.two((delta, beta), (1e-7, 1e-11))
+    assert read_gaussians(path).matter == Matter.several((delta, beta), (1e-7, 1e-11))

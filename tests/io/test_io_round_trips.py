@@ -150,7 +150,7 @@ def objects(draw: st.DrawFn) -> Stored:
     """Gaussians or voxels of one, two or free materials, or surfaces, with values of any size."""
     pair, unit = draw(vectors(-1e-5, 1e-5, 2, 2)).tolist(), draw(numbers(1e-9, 1e-3))
     one = Matter.one(*pair[0])
-    matter = draw(st.sampled_from([one, Matter.two(*pair), Matter.free(*pair[0])]))
+    matter = draw(st.sampled_from([one, Matter.several(*pair), Matter.free(*pair[0])]))
     kind = draw(st.sampled_from(["gaussians", "voxels", "surfaces"]))
     if kind == "gaussians":
         centres, scales, *rest = draw(clouds(channels=len(matter)))

@@ -175,7 +175,7 @@ def test_a_moving_glb_is_where_the_bodies_are(share, tmp_path):
 
 def gaussians(channels: int = 1) -> GaussianCloud:
     centres, scales, quaternions, amplitudes = cloud("ordinary", channels, 60)
-    matter = MATTER if channels == 1 else Matter.two((4e-7, 2e-10), (1e-7, 1e-10))
+    matter = MATTER if channels == 1 else Matter.several((4e-7, 2e-10), (1e-7, 1e-10))
     return GaussianCloud((centres, scales.log(), quaternions, raw_of(amplitudes.abs() + 0.05)), PIXEL, matter)
 
 

@@ -124,7 +124,7 @@ def test_a_network_of_one_material_is_not_asked_for_two(scan, monkeypatch):
 
     _, _, decision, guess = begun(scan, monkeypatch, 0.0, two)
 
-    assert decision.line == "start: phase retrieval (two materials are known, and the network guesses one)"
+    assert decision.line == "start: phase retrieval (several materials are known, and the network guesses one)"
     assert guess is None
 
 

@@ -130,7 +130,7 @@ def test_too_few_views_are_said(sharp):
 def test_the_kind_that_is_told_is_taken(sharp):
     assert settled(SMALL, Task(sharp, KNOWN), "continuous").matter == "continuous"
     two = MaterialPrior.known(DeltaBeta(2e-7, 1e-10), DeltaBeta(1e-7, 1e-10))
-    with pytest.raises(InputError, match="--matter must be levels or auto where two materials are known"):
+    with pytest.raises(InputError, match="--matter must be levels or auto where several materials are known"):
         settled(SMALL, Task(sharp, two), "continuous")
 
 

@@ -182,6 +182,6 @@ def test_what_does_not_fit_together_is_refused():
     with pytest.raises(InputError, match=r"weights/features\.weight of the network must have the shape"):
         made(network=AlignedNetwork((3, 4), 6, 2))
     with pytest.raises(InputError, match="one material, or has δ and β free, but there are two"):
-        made(matter=Matter.two((1e-6, 1e-9), (5e-7, 1e-9)))
+        made(matter=Matter.several((1e-6, 1e-9), (5e-7, 1e-9)))
     with pytest.raises(InputError, match="image must have 2 to 10 levels"):
         AlignedNetwork((4,))

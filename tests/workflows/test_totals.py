@@ -92,7 +92,7 @@ def test_two_materials_and_free_channels_have_a_total(scan):
     occupancy = torch.from_numpy(true / CELL.delta).float()
     half = torch.stack([0.5 * occupancy, occupancy])
     for matter, values in (
-        (Matter.two(CELL, (0.5 * CELL.delta, 0.5 * CELL.beta)), half),
+        (Matter.several(CELL, (0.5 * CELL.delta, 0.5 * CELL.beta)), half),
         (Matter.free(*CELL), torch.stack([occupancy, occupancy])),
     ):
         said = Prediction(VoxelGrid(values, grid, matter), scan.train().exposures, 2)

@@ -1,4 +1,4 @@
-"""Two materials in one scan: whether there are two, where each of them is, and what it absorbs.
+"""Several materials in one scan: whether there are two, where each is, and what it absorbs.
 
 Phase retrieval of single views needs one ratio δ/β for all matter. Where there are two, it leaves halos and levels
 that are wrong by tens of per cent. But its volume tells the two apart by their δ, and frames blurred beyond their
@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -67,11 +68,11 @@ DEFAULT = TwoMaterials()
 
 @dataclass(frozen=True)
 class Shares:
-    """Occupancies of two materials on a grid: values [2, Z, Y, X] float32, materials: (δ, β) of each, denser first."""
+    """Occupancies of materials on a grid: values [C, Z, Y, X] float32, materials: (δ, β) of each, densest first."""
 
     values: Tensor
     grid: Grid
-    materials: tuple[DeltaBeta, DeltaBeta]
+    materials: tuple[DeltaBeta, ...]
 
 
 @dataclass(frozen=True)
@@ -135,18 +136,17 @@ def _two_medians(values: np.ndarray) -> tuple[float, float]:
 
 
 def told_apart(delta: Tensor, levels: Sequence[float], pixel: int, options: TwoMaterials = DEFAULT) -> Tensor:
-    """Occupancies [2, Z, Y, X] of the materials of δ `levels` (higher, lower) in a volume [Z, Y, X] of δ.
+    """Occupancies [C, Z, Y, X] of the materials of δ `levels`, the highest first, in a volume [Z, Y, X] of δ.
 
-    Voxels nearer to the lower level are full of the lighter material, unless they are part of a layer thinner than
-    about two pixels: between the denser one and nothing every value occurs. All others hold the denser one in part.
+    Voxels nearest to a lower level are full of its material, unless they are part of a layer thinner than about two
+    pixels: between the densest one and nothing every value occurs. All others hold the densest one in part.
     """
     values = delta.numpy()
-    high, low = levels
-    between = (values > 0.5 * low) & (values <= 0.5 * (low + high))
-    lighter = binary_opening(between, iterations=pixel)
-    denser = np.where(lighter, 0, np.clip(values / high, 0, 1))
-    denser[denser < options.sliver] = 0
-    return torch.from_numpy(np.stack([denser, lighter]).astype(np.float32))
+    edges = [0.5 * (level + below) for level, below in zip(levels, [*levels[1:], 0.0])]
+    lighter = [binary_opening((values > low) & (values <= high), iterations=pixel) for high, low in pairwise(edges)]
+    densest = np.where(np.any(lighter, axis=0), 0, np.clip(values / levels[0], 0, 1))
+    densest[densest < options.sliver] = 0
+    return torch.from_numpy(np.stack([densest, *lighter]).astype(np.float32))
 
 
 def absorption(
@@ -181,7 +181,7 @@ def absorption(
 
 
 def at_one_ratio(scan: Scan, shares: Shares, ratio: float, backend: Backend = "auto") -> Scan:
-    """The scan as if both materials had the ratio δ/β `ratio`, by what the wave optics says of `shares`."""
+    """The scan as if all materials had the ratio δ/β `ratio`, by what the wave optics says of `shares`."""
     instrument, lines = _lines(scan, shares.values, shares.grid, backend)
     same = [(delta, delta / ratio) for delta, _ in shares.materials]
     change = _frames(instrument, lines, same) / _frames(instrument, lines, shares.materials).clamp_min(1e-3)

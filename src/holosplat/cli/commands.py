@@ -311,7 +311,7 @@ def demo(out: Output = Path("demo")) -> None:
     beamline = BeamlineOptions(DETECTOR, psf_sigma_px=0.05, views=16)
     simulate(tuple(paths), beamline=beamline, out=scan, truth=TruthOptions(truth))
     _say(f"\n$ holosplat reconstruct {scan} --material haemoglobin --out {run}")
-    reconstruct(scan, run, Asked(PriorOptions("haemoglobin")))
+    reconstruct(scan, run, Asked(PriorOptions(("haemoglobin",))))
     _say(f"\n$ holosplat evaluate {run} --truth {truth}")
     evaluate(run, truth=truth)
 

@@ -115,7 +115,7 @@ def convert(
     prior = matter.prior(scan.exposures.reference_energy)
     wanted = evening.still_light is not None or to in GOES_WITH["material"]
     require(not prior.fixes_ratio or wanted, f"a material is not needed with --to {to}; leave it.")
-    require(len(prior.materials) < 2, f"--to {to} takes one material; leave --second-material.")
+    require(len(prior.materials) < 2, f"--to {to} takes one material; give --material once.")
     scan = evening.applied(scan, prior)
     if to == "nxtomo":
         require(not out.is_dir(), f"{out} must be a file to write, but it is a folder; add a file name.")

@@ -11,7 +11,7 @@ import numpy as np
 from ..io.formats import read_frames
 from ..io.reading import Reading
 from ..io.run_scan import run_source
-from ..matter import KnownTwo, MaterialPrior, MatterKind
+from ..matter import KnownSeveral, MaterialPrior, MatterKind
 from ..methods import Auto, Method
 from ..motion.flow_reconstruction import FlowOptions
 from ..optics.background import LightOptions
@@ -58,8 +58,8 @@ def reconstruct_in_motion(
     planned = read_frames(scan, replace(reading, told=reading.told.at_middle()))
     train = planned.exposures[~planned.is_test]
     count = len(np.unique(train.time))
-    if isinstance(prior, KnownTwo):
-        return _still("a flow carries one material, but two are known, and motion is not asked of the frames")
+    if isinstance(prior, KnownSeveral):
+        return _still("a flow carries one material, but several are known, and motion is not asked of the frames")
     if count < FEWEST_TIMES:
         return _still(f"motion is asked of frames of {FEWEST_TIMES} times or more, but there are {count}")
     tell_frames("matter in motion", train, folder.path, lambda seen: of_motion(seen, options))

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from ..beamline.scenes import Filling
     from ..beamline.series import SeriesFiles, Timing
     from ..beamline.simulate import Shutter, Simulation
-    from ..matter import DeltaBeta, MaterialPrior, MatterKind
+    from ..matter import MaterialPrior, MatterKind
     from ..methods import Method
     from ..scan import Exposures
 
@@ -314,14 +314,10 @@ class MethodOptions:
 class PriorOptions:
     """What is known of the matter; without any of these, one material or two are found, with their δ and β."""
 
-    material: str | None = None
-    """Formula or name of the material, if known (then δ and β are)."""
-    density: Grams | None = None
-    """Its density [g/cm³]; a named one has its own."""
-    second_material: str | None = None
-    """Formula or name of another material, where there are two."""
-    second_density: Grams | None = None
-    """Its density [g/cm³]; a named one has its own."""
+    material: UseAppendAction[tuple[str, ...]] = ()
+    """Formula or name of the material, if known (then δ and β are); again for each further one."""
+    density: UseAppendAction[tuple[Grams, ...]] = ()
+    """Density of each material [g/cm³], or of each that is a formula, in their order; a named one has its own."""
     medium: str | None = None
     """Formula or name of what surrounds them; none means vacuum."""
     medium_density: Grams | None = None
@@ -335,29 +331,39 @@ class PriorOptions:
 
     def without_ranges(self) -> PriorOptions:
         """The same, with nothing where a range is said."""
-        require(self.material is None or self.delta_beta is None, "give --material or --delta-beta, not both.")
+        require(not self.material or self.delta_beta is None, "give --material or --delta-beta, not both.")
         return replace(self, delta_beta=None) if self.ranges() else self
 
     def prior(self, energy_kev: float) -> MaterialPrior:
         """The prior at `energy_kev` [keV]. Errors: `InputError` for a range of δ/β."""
         from ..matter import MaterialPrior
 
-        require(self.material is None or self.delta_beta is None, "give --material or --delta-beta, not both.")
-        if self.material is None:
-            belongs = ("density", "second_material", "second_density", "medium", "medium_density")
-            stray = [f"--{name.replace('_', '-')}" for name in belongs if getattr(self, name) is not None]
+        require(not self.material or self.delta_beta is None, "give --material or --delta-beta, not both.")
+        if not self.material:
+            belongs = ("density", "medium", "medium_density")
+            stray = [f"--{name.replace('_', '-')}" for name in belongs if getattr(self, name) not in (None, ())]
             beside = " rather than --delta-beta" if self.delta_beta is not None else ""
             require(not stray, f"{', '.join(stray)} can only go with --material{beside}; add it, or leave them.")
             if isinstance(self.delta_beta, str):
                 said = f"it is {self.delta_beta!r}; a range is for reconstruct alone."
                 raise InputError(f"--delta-beta must be one number here, but {said}")
             return MaterialPrior.unknown() if self.delta_beta is None else MaterialPrior.of_ratio(self.delta_beta)
-        first = self._known(self.material, self.density, energy_kev)
-        medium = self.medium or ""
-        if self.second_material is None:
-            require(self.second_density is None, "--second-density needs --second-material.")
-            return MaterialPrior.known(first, medium=medium)
-        return MaterialPrior.known(first, self._known(self.second_material, self.second_density, energy_kev), medium)
+        around = (self.medium, self.medium_density)
+        told = (MaterialOptions(*each, *around).filling().of("", energy_kev) for each in self._with_densities())
+        return MaterialPrior.known(*told, medium=self.medium or "")
 
-    def _known(self, name: str, density: float | None, energy_kev: float) -> DeltaBeta:
-        return MaterialOptions(name, density, self.medium, self.medium_density).filling().of("", energy_kev)
+    def _with_densities(self) -> list[tuple[str, float | None]]:
+        """Each material with the density that is given for it."""
+        from ..materials import is_named
+
+        count = len(self.density)
+        if count == len(self.material):
+            return list(zip(self.material, self.density))
+        formulas = [name for name in self.material if not is_named(name)]
+        require(
+            count in (0, len(formulas)),
+            f"--density must be given once for each material, or once for each formula ({len(formulas)}), but it is "
+            f"given {count} times; leave those of materials with a name.",
+        )
+        densities = iter(self.density)
+        return [(name, None if is_named(name) else next(densities, None)) for name in self.material]

@@ -52,7 +52,9 @@ class OneMaterial:
 
     def at(self, energy_kev: float) -> tuple[DeltaBeta, bool]:
         """δ and β at `energy_kev` [keV], and whether δ is known, not only δ/β."""
-        prior = PriorOptions(**vars(self)).prior(energy_kev)
+        material = () if self.material is None else (self.material,)
+        density = () if self.density is None else (self.density,)
+        prior = PriorOptions(material, density, self.medium, self.medium_density, self.delta_beta).prior(energy_kev)
         require(prior.fixes_ratio, "retrieve needs --material or --delta-beta, but neither is given; add one of them.")
         if isinstance(prior, KnownRatio):
             return DeltaBeta(STAND_IN_DELTA, STAND_IN_DELTA / prior.ratio), False

@@ -33,11 +33,13 @@ MATTER = 0.05
 @dataclass(frozen=True)
 @ranged
 class ContinuousPrior:
-    """The prior of continuous matter: `a Σ log(1 + (√(|∇u|² + ε²) - ε) / b) + m Σ log(1 + u / v)`.
+    """The prior of matter: `a Σ log(1 + (√(|∇u|² + ε²) - ε) / b) + m Σ log(1 + d(u) / v)`.
 
-    Slopes of few voxels are large, those of most are almost zero, and most of space is empty: logarithms, as of
-    power laws, hardly shrink what is large, where total variation takes from every edge in proportion to its height
-    (Nikolova 2005). As the misfit is in units of the noise, a and m have no unit, and hold for every noise.
+    Slopes of few voxels are large, those of most are almost zero, and most of space is empty, or full of one of the
+    materials that are known: d is the distance to the nearest of these levels, one of which is 0, the medium.
+    Logarithms, as of power laws, hardly shrink what is large, where total variation takes from every edge in proportion
+    to its height (Nikolova 2005). As the misfit is in units of the noise, a and m have no unit, and hold for every
+    noise.
     """
 
     slopes: Weight = 0.4
@@ -49,7 +51,9 @@ class ContinuousPrior:
     values: Weight = 0.02
     """m: exponent of the power law of values."""
     value: Weight = 0.05
-    """v: value beyond which the law holds, as a share of the level."""
+    """v: distance from the nearest level beyond which the law holds, as a share of the matter's level."""
+    levels: tuple[float, ...] = ()
+    """Occupancies of the known materials, rising from above 0; none where no density is known."""
 
     def __post_init__(self) -> None:
         for name in ("slope", "rounding", "value"):
@@ -62,9 +66,17 @@ class ContinuousPrior:
 
     def on_larger_voxels(self, factor: int) -> ContinuousPrior:
         """The prior on voxels `factor` times larger: slopes are as much steeper, and every voxel stands for more."""
-        return ContinuousPrior(
-            self.slopes * factor, self.slope * factor, self.rounding * factor, self.values * factor**2, self.value
-        )
+        steeper = {name: factor * getattr(self, name) for name in ("slopes", "slope", "rounding")}
+        return replace(self, **steeper, values=factor**2 * self.values)
+
+    def distance(self, u: Tensor, epsilon: float) -> tuple[Tensor, Tensor]:
+        """How far u ≥ 0 is from the nearest level, and the slope of that; within `epsilon` of a known one a square."""
+        if not self.levels:
+            return u, torch.ones_like(u)
+        levels = u.new_tensor([0.0, *self.levels])
+        away = u - levels[torch.bucketize(u, 0.5 * (levels[1:] + levels[:-1]))]
+        size = (away.square() + epsilon**2).sqrt()
+        return size - epsilon, away / size
 
 
 class VolumeProblem:
@@ -118,13 +130,14 @@ class VolumeProblem:
         b, epsilon, v = prior.slope * level, prior.rounding * level, prior.value * level
         size = _slopes(u, epsilon)
         value = prior.slopes * float(((size - epsilon) / b).log1p().double().sum())
-        value += prior.values * float((u / v).log1p().double().sum())
+        away, slope = prior.distance(u, epsilon)
+        value += prior.values * float((away / v).log1p().double().sum())
         pull = prior.slopes / ((b - epsilon + size) * size)
         for axis in range(3):
             flow = pull.narrow(axis, 0, u.shape[axis] - 1) * u.diff(dim=axis)
             gradient.narrow(axis, 1, u.shape[axis] - 1).add_(flow)
             gradient.narrow(axis, 0, u.shape[axis] - 1).sub_(flow)
-        gradient.add_(prior.values / (v + u))
+        gradient.add_(slope.mul_(prior.values / (v + away)))
         return value
 
     def preconditioner(self, u: Tensor, times: int = 1) -> Callable[[Tensor], Tensor]:

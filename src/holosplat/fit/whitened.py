@@ -109,6 +109,8 @@ class WhitenedFrames:
         self.shape, self.pixel = (train.views.shape[0], train.views.shape[1]), train.views.finest
         frames, on = torch.from_numpy(train.frames), self.instrument.device
         self._amplitudes = frames.clamp_min(0).sqrt().to(on)
+        self.absorbed: Tensor | None = None
+        """Line integrals [V, H, W] of β beside that of the material, in (the smallest) pixels; None for none."""
         self._missing = None if train.gaps is None else train.gaps.to(on)
         self._light = None if light is None else light.factor().detach().to(on)
         power = noise.power()
@@ -149,6 +151,16 @@ class WhitenedFrames:
 
     def amplitudes(self, lines: Tensor) -> Tensor:
         """√I [V, H, W] of line integrals [V, H, W] in pixels of path length; differentiable."""
+        waves, materials = self._waves(lines)[:, None], [self.material]
+        if self.absorbed is not None:
+            waves = torch.cat([waves, self._waves(self.absorbed)[:, None]], dim=1)
+            materials.append(DeltaBeta(0.0, 1.0))
+        frames = self.instrument.frames(LineIntegrals(waves, tuple(materials)))
+        frames = frames if self._light is None else frames * self._light
+        return frames.clamp_min(DARKEST).sqrt()
+
+    def _waves(self, lines: Tensor) -> Tensor:
+        """Line integrals [V, H, W] in pixels as those [m] on the raster of the waves."""
         (my, mx), s = self.instrument.margin, self.instrument.oversample
         my -= self.beyond
         padded = pad(lines, (mx, mx, my, my)) * self.pixel
@@ -162,10 +174,7 @@ class WhitenedFrames:
             if w % 2 == 0:
                 fine[:, :, w // 2] *= 0.5  # the highest frequency stands for both signs
             spectrum = fine * s**2
-        waves = torch.fft.irfft2(spectrum, s=(h * s, w * s))
-        frames = self.instrument.frames(LineIntegrals(waves[:, None], (self.material,)))
-        frames = frames if self._light is None else frames * self._light
-        return frames.clamp_min(DARKEST).sqrt()
+        return torch.fft.irfft2(spectrum, s=(h * s, w * s))
 
     def __call__(self, lines: Tensor) -> Misfit:
         """Misfit of line integrals [V, H, W] and its gradient."""

@@ -28,7 +28,7 @@ def read_gaussians(path: Path) -> GaussianCloud:
         second = None if other is None else attribute_numbers(f"{path}: @second", other, (2,))
     tensors = [torch.from_numpy(finite(label, array).astype(np.float32)) for label, array in arrays.items()]
     if second is not None:
-        matter = Matter.two((delta, beta), (float(second[0]), float(second[1])))
+        matter = Matter.several((delta, beta), (float(second[0]), float(second[1])))
     else:
         matter = Matter.one(delta, beta) if tensors[3].shape[1:] == (1,) else Matter.free(delta, beta)
     try:

@@ -28,7 +28,7 @@ OPAQUE = 0.99
 MOST_PIXELS = 512
 """Pixels along an edge of the image in which the thickest ray is looked for."""
 COLOURS = np.array([[0.90, 0.85, 0.78], [0.30, 0.55, 0.85]])
-"""Of the first material, and of the second."""
+"""Of the first material, and of the second; then of both again."""
 CONSTANT = 0.5 / math.sqrt(math.pi)
 """The spherical harmonic of degree 0: viewers show 0.5 + CONSTANT f_dc."""
 NAMES = (
@@ -82,9 +82,9 @@ def opacities(cloud: GaussianCloud, deepest: float = DEPTH) -> np.ndarray:
 
 
 def colours(cloud: GaussianCloud) -> np.ndarray:
-    """Colours [N, 3], 0 to 1: one for one material, mixed by their shares where there are two."""
-    if cloud.matter.second is None:
+    """Colours [N, 3], 0 to 1: one for one material, mixed by their shares where there are several."""
+    if not cloud.matter.others:
         return np.broadcast_to(COLOURS[0], (len(cloud), 3))
     amplitudes = cloud.amplitudes.double().numpy()
     shares = amplitudes / np.maximum(amplitudes.sum(axis=1, keepdims=True), 1e-30)
-    return shares @ COLOURS
+    return shares @ COLOURS[np.arange(shares.shape[1]) % len(COLOURS)]

@@ -18,14 +18,12 @@ def assumed_material(
 ) -> DeltaBeta:
     """δ and β of one material for all matter: as known, or as the training frames `scan` suggest.
 
-    Where two are known, it has the δ of the denser, and the ratio of an equal mixture. What is estimated has the sign
-    of δ that the prior says, or is above the medium where it says none.
+    Where several are known, it has the δ of the first, and the ratio of an equal mixture. What is estimated has the
+    sign of δ that the prior says, or is above the medium where it says none.
     """
-    if len(prior.materials) == 2:
-        (denser, dark), (lighter, bright) = prior.materials
-        return DeltaBeta(denser, denser * (dark + bright) / (denser + lighter))
     if prior.materials:
-        return prior.materials[0]
+        deltas, betas = zip(*prior.materials)
+        return DeltaBeta(deltas[0], deltas[0] * sum(betas) / sum(deltas)) if betas[1:] else prior.materials[0]
     how = (on_progress, backend, options, prior.delta_sign)
     ratio = prior.ratio if isinstance(prior, KnownRatio) else estimate_ratio(scan, *how)
     delta = estimate_delta(scan, ratio, *how)

@@ -215,7 +215,8 @@ def on_pixels(mesh: SurfaceMesh, pixel: float, edge: float) -> SurfaceMesh:
     vertices, faces = mesh.vertices.cpu() * (mesh.unit_length / pixel), mesh.faces.cpu()
     while float(edge_lengths(vertices, faces).mean()) > edge:
         vertices, faces = loop_subdivision(vertices, faces)
-    return SurfaceMesh(vertices, faces, pixel, mesh.matter, mesh.lines)
+    finer = len(faces) // len(mesh.faces)
+    return SurfaceMesh(vertices, faces, pixel, mesh.matter, mesh.lines, [finer * count for count in mesh.parts])
 
 
 def mean_chord(mesh: SurfaceMesh) -> float:

@@ -16,6 +16,7 @@ from ..optics.noise import noise_share
 from ..representations import GaussianCloud, SurfaceMesh
 from .coarse import Way, settled, unexplained
 from .gaussian_options import GaussianOptions
+from .level_surfaces import surfaces_of_levels
 from .method import Task
 from .sharp_level import material_of_levels
 from .surface_fit import SurfaceOptions, cut_surfaces, extract_surfaces
@@ -30,7 +31,7 @@ def first_surfaces(
 
     The task is `bounded`. In noise (`HolographicTV.noisy`) surfaces are those of Gaussians `fitted` to the frames,
     whose start and terms on the volume hold against it; and those of the volume are the second way, for of bodies that
-    pixels hardly resolve Gaussians may lose most.
+    pixels hardly resolve Gaussians may lose most. Several known materials have one way (`surfaces_of_levels`).
     """
 
     def of_volume(before: SurfaceMesh | None) -> SurfaceMesh:
@@ -39,6 +40,9 @@ def first_surfaces(
     def of_turns(before: SurfaceMesh | None) -> SurfaceMesh | None:
         after = None if before is None else in_turns(task, before, options, surfaces)
         return None if after is before else after
+
+    if len(task.prior.materials) > 1:
+        return (_if_any(lambda before: surfaces_of_levels(task, options, surfaces)),)
 
     def of_gaussians(before: SurfaceMesh | None) -> SurfaceMesh | None:
         cloud = fitted(task)

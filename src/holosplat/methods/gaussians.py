@@ -193,7 +193,7 @@ class GaussianStage:
 
 def resolved(options: FitOptions, task: Task, matter: Matter) -> FitOptions:
     """The options without what bounds the occupancy where nothing says what an occupancy of one is."""
-    if task.bounded or (task.matter == "levels" and matter.second is not None):
+    if task.bounded or (task.matter == "levels" and bool(matter.others)):
         return options
     return replace(options, objective=replace(options.objective, overfull=0.0, two_levels=0.0))
 

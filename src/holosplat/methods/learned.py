@@ -86,8 +86,8 @@ def guessed_start(task: Task, options: GaussianOptions, fitted: Fitted, plain: P
     fitted: the fit of Gaussians; plain: the null, as surfaces where it is some. Errors: those of `guess_matter`, of the
     weights' file and of all starts.
     """
-    if len(task.prior.materials) == 2:
-        task.on_start(Decision(NAME, PLAIN, "two materials are known, and the network guesses one"), None)
+    if len(task.prior.materials) > 1:
+        task.on_start(Decision(NAME, PLAIN, "several materials are known, and the network guesses one"), None)
         return None
     material = material_of_levels(task, options.volume.backend, options.estimate)
     how, trained = options.learned, options.learned.network

@@ -19,7 +19,7 @@ from torch import Tensor
 from ..baselines.material import plateau
 from ..baselines.two_materials import best_levels, told_apart
 from ..inference import Decision, Score, select
-from ..matter import KnownTwo, MaterialPrior, MatterKind
+from ..matter import MaterialPrior, MatterKind
 from ..representations import VoxelGrid
 from .first_volumes import BY_FISSION, FirstVolumes, predictions
 from .method import Method, Task, solve_stages
@@ -29,6 +29,7 @@ from .uncertain import Determined, likeliest_ratio
 STAGE = "levels or continuous matter"
 NAME = "matter"
 LEVELS = ("one level", "two levels")
+SEVERAL = "several levels"
 CONTINUOUS = "continuous"
 
 
@@ -40,8 +41,8 @@ def decide_matter(task: Task, methods: Mapping[MatterKind, Method] | None = None
     bounds nothing; where flat volumes predict neither better nor worse, these are fitted. One ratio δ/β holds one
     level. Of views that are too few to set some aside, levels are taken.
     """
-    if isinstance(task.prior, KnownTwo):
-        return Decision(NAME, LEVELS[1], "two materials are known")
+    if len(task.prior.materials) > 1:
+        return Decision(NAME, SEVERAL, "several materials are known")
     task.on_progress(STAGE, 0.0)
     first = first_of_task(task)
     if first.folds.by == BY_FISSION:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
@@ -17,6 +17,7 @@ from ..fit.running import Record, interrupts_held
 from ..fit.smooth_volume import ContinuousPrior, Descent, VolumeProblem
 from ..fit.whitened import WhitenedFrames
 from ..geometry import Grid
+from ..matter import DeltaBeta
 from ..memory import memory_kept
 from ..model import Instrument, Model
 from ..optics.background import Light
@@ -24,6 +25,7 @@ from ..optics.noise_model import NoiseModel
 from ..optics.sampling import fringe_sampling
 from ..representations import VoxelGrid
 from ..scan import Scan
+from .known_levels import KnownLevels
 from .modulation import modulated, unshrunk
 
 EXPLAINED, WEAKER = 0.95, 0.98
@@ -88,6 +90,13 @@ class SmoothPlan:
     faint: float
     loose: float
     backend: str
+    known: tuple[DeltaBeta, ...] = ()
+    """Materials that are known, of one sign of δ."""
+
+    @property
+    def levels(self) -> KnownLevels:
+        """The same in the unit of the start."""
+        return KnownLevels(self.known, self.begun.matter.channels[0])
 
     @property
     def beyond(self) -> int:
@@ -130,6 +139,7 @@ class SmoothFit:
         self._strength, self._settled, self._kept = 1.0, False, False
         self._stronger: tuple[VoxelGrid, float] | None = None
         self._descent: Descent | None = None
+        self._begun = plan.begun.values[0]
         self._values: list[float] = []
         self._frames: tuple[int, WhitenedFrames] | None = None
 
@@ -244,7 +254,8 @@ class SmoothFit:
 
     def _descent_from(self, u: Tensor, frames: WhitenedFrames, leg: Leg) -> Descent:
         """A descent that begins at u [Z, Y, X], where the backend computes."""
-        problem = self._problem(frames, leg.factor)
+        self._begun = u
+        problem = self._problem(frames, leg.factor, u)
         return Descent(problem, u.to(problem.device), self._kept)
 
     def _end(self, leg: Leg, descent: Descent) -> None:
@@ -300,6 +311,8 @@ class SmoothFit:
         """u with what the prior has taken: the edges' way between rounds, the total's at the end. Low frequencies see
         the total by its absorption, so where δ/β was estimated they are no better than the others."""
         last = self._leg == len(self._legs) - 1
+        if last and self.plan.known:
+            return u
         told = last and self.plan.ratio_known
         return unshrunk(problem, u, self.plan.light is not None) if told else modulated(problem, u)
 
@@ -330,10 +343,14 @@ class SmoothFit:
         """Begin anew with a prior of that `strength`."""
         self._leg, self._volume, self._rival, self._strength = 0, self.plan.begun, None, strength
 
-    def _problem(self, frames: WhitenedFrames, factor: int) -> VolumeProblem:
+    def _problem(self, frames: WhitenedFrames, factor: int, u: Tensor) -> VolumeProblem:
         prior = self.plan.prior.weakened(self._strength)
         prior = prior if factor == 1 else prior.on_larger_voxels(factor)
-        return VolumeProblem(frames, prior, self._level, self.plan.backend)
+        prior = replace(prior, levels=self.plan.levels.occupancies)
+        problem = VolumeProblem(frames, prior, self._level, self.plan.backend)
+        beside = self.plan.levels.absorbed(u.to(problem.device))
+        frames.absorbed = None if beside is None else problem.lines(beside)
+        return problem
 
     def _frames_of(self, factor: int) -> WhitenedFrames:
         if self._frames is None or self._frames[0] != factor:
@@ -355,7 +372,7 @@ class SmoothFit:
             "more": self._more,
             "values": self._values,
             "rival": None if self._rival is None else [self._rival[0].cpu(), self._rival[1]],
-            "descent": None if self._descent is None else self._descent.state_dict(),
+            "descent": None if self._descent is None else self._descent.state_dict() | {"begun": self._begun.cpu()},
         }
 
     def load(self, state: dict[str, Any]) -> None:
@@ -371,7 +388,8 @@ class SmoothFit:
         self._descent = None
         if state["descent"] is not None:
             factor = self._legs[self._leg].factor
-            problem = self._problem(self._frames_of(factor), factor)
+            self._begun = state["descent"]["begun"]
+            problem = self._problem(self._frames_of(factor), factor, self._begun)
             self._descent = Descent.again(problem, state["descent"], problem.device)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from ..backends import resolve
 from ..checks import require
 from ..inference import Decision
-from ..matter import KnownTwo, MatterKind
+from ..matter import KnownSeveral, MatterKind
 from ..representations import Stored
 from ..scan import Scan
 from ..tables import to_table
@@ -70,11 +70,11 @@ def settled(
     """The method to run for `task`, the kind of its matter (`matter`, or what the frames say), and what is `uncertain`.
 
     Where nothing is known, δ/β of continuous matter is uncertain, too; for `Auto` that of one level. Errors:
-    `InputError` for continuous matter of two materials, and those of `determine`.
+    `InputError` for continuous matter of several materials, and those of `determine`.
     """
     require(
-        not (matter == "continuous" and isinstance(task.prior, KnownTwo)),
-        "--matter must be levels or auto where two materials are known, but it is continuous; leave --second-material.",
+        not (matter == "continuous" and isinstance(task.prior, KnownSeveral)),
+        "--matter must be levels or auto where several materials are known, but it is continuous; give one --material.",
     )
     if isinstance(method, Gaussians):
         resolve(method.fit.backend)  # before the decision, which takes its time

@@ -13,15 +13,17 @@ from torch import Tensor
 from ..backends import resolve
 from ..baselines import holographic_tv
 from ..baselines.two_materials import Shares, absorption, at_one_ratio, told_apart, two_levels
+from ..checks import require
 from ..geometry import Grid
 from ..matter import DeltaBeta, KnownRatio, Matter
+from ..model.instrument import MOST_CHANNELS
 from ..optics.noise import noise_share
 from ..optics.retrieval import retrieve_thickness
 from ..representations import (
     GaussianCloud,
     approximate,
     at_pitch,
-    cloud_from_two,
+    cloud_from_shares,
     cloud_from_volume,
     freed,
     random_cloud,
@@ -41,6 +43,11 @@ def starting_cloud(task: Task, options: GaussianOptions) -> GaussianCloud:
     Where nothing is known of the matter, δ and β are free (`options.separate`, and at a random start), or those of the
     one material or the two that frames suggest.
     """
+    require(
+        len(task.prior.materials) <= MOST_CHANNELS,
+        f"Gaussians are of {MOST_CHANNELS} materials at most, but {len(task.prior.materials)} are known; give fewer, "
+        "or --method auto where frames show their surfaces.",
+    )
     return (_random if options.start == "random" else _from_phase_retrieval)(task, options)
 
 
@@ -67,7 +74,7 @@ def _from_phase_retrieval(task: Task, options: GaussianOptions) -> GaussianCloud
         return cloud_of(volume, grid, material, task, options)
     pitch, (volume, grid) = scan.views.finest, (shares.values, shares.grid)
     whole, spacing = at_pitch(volume, grid, pitch), _spacing_px(scan, options) * pitch
-    cloud = cloud_from_two(*whole, shares.materials, spacing, pitch, options.max_start, options.filled)
+    cloud = cloud_from_shares(*whole, shares.materials, spacing, pitch, options.max_start, options.filled)
     return _approximate(cloud, volume, grid, task, options)
 
 
@@ -84,11 +91,11 @@ def _approximate(
 def _shares(
     task: Task, options: GaussianOptions, material: DeltaBeta, found: tuple[Tensor, Grid], retrieve: Retrieve
 ) -> Shares | None:
-    """Where two materials are, if two are known, or nothing is and the volume `found` of `material` shows two."""
+    """Where materials are, if several are known, or nothing is and the volume `found` of `material` shows two."""
     (volume, grid), scan, prior, backend = found, task.scan, task.prior, options.volume.backend
     pixel, how = round(scan.views.finest / grid.voxel_size[0]) or 1, options.two_materials
-    known = prior.materials if len(prior.materials) == 2 else ()
-    levels = (abs(known[0].delta), abs(known[1].delta)) if known else None
+    known = prior.materials if len(prior.materials) > 1 else ()
+    levels = tuple(abs(material.delta) for material in known) or None
     if task.matter == "levels" and not prior.fixes_ratio and options.most_materials == 2 and not options.separate:
         levels = two_levels(volume * abs(material.delta), pixel, how)
     if levels is None:
@@ -99,8 +106,7 @@ def _shares(
         values = told_apart(size, levels, pixel, how)
         deltas = [material.sign * level for level in levels]
         betas = [m.beta for m in known] or absorption(scan, values, grid, deltas, backend, how)
-        first, second = (DeltaBeta(*pair) for pair in zip(deltas, betas))
-        shares = Shares(values, grid, (first, second))
+        shares = Shares(values, grid, tuple(DeltaBeta(*pair) for pair in zip(deltas, betas)))
         volume, grid = retrieve(at_one_ratio(scan, shares, material.ratio, backend))
     return replace(shares, values=told_apart(volume * abs(material.delta), levels, pixel, how), grid=grid)
 
@@ -131,5 +137,5 @@ def _random(task: Task, options: GaussianOptions) -> GaussianCloud:
     thickness = max(float(retrieved.mean()) / disc, 0.1 * pitch)
     matter = Matter.one(*material) if prior.fixes_ratio else Matter.free(*material)
     if len(prior.materials) == 2:
-        matter = Matter.two(*prior.materials)
+        matter = Matter.several(*prior.materials)
     return random_cloud(options.random_count, scan.views, matter, thickness, task.seed)

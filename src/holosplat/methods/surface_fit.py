@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Self
 
+import numpy as np
 import torch
+from scipy.ndimage import binary_dilation
 from scipy.sparse import csc_array, csr_array, diags_array, eye_array
 from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from ..backends import Backend, device, resolve
+from ..baselines.two_materials import told_apart
 from ..checks import in_range, positive, require
 from ..fit.loop import Fit, Plan
 from ..fit.optimiser import Adam, Group
@@ -35,6 +38,8 @@ from .ground import ExtraTerm, ground
 VERTICES = "object.vertices"
 BETAS, EPSILON = (0.9, 0.99), 1e-30
 """Adam's constants for vertices (Nicolet et al. 2021)."""
+NEAR = 2
+"""Voxels within which a material is near: that far a pixel's blur reaches."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +110,7 @@ def extract_surfaces(cloud: GaussianCloud, scan: Scan, options: Extraction = Ext
 
     Errors: `InputError` if the cloud is not of one material, or there is no such surface.
     """
-    has = "two materials" if cloud.matter.second else "δ and β apart"
+    has = "several materials" if cloud.matter.others else "δ and β apart"
     require(
         cloud.matter.single,
         f"surfaces need one material of known δ and β, but this run has {has}; "
@@ -120,13 +125,40 @@ def extract_surfaces(cloud: GaussianCloud, scan: Scan, options: Extraction = Ext
 def cut_surfaces(
     occupancy: Tensor, grid: Grid, unit_length: float, matter: Matter, options: Extraction = Extraction()
 ) -> SurfaceMesh:
-    """The surfaces [`unit_length`] where occupancy [Z, Y, X] on `grid` crosses the level, filled with `matter`.
+    """The surfaces [`unit_length`] where occupancy [Z, Y, X] of the first material on `grid` crosses the level from
+    each material of `matter`, the strongest first, to those of weaker contrast and the medium.
 
-    Errors: `InputError` if there is no such surface.
+    The level lies between those materials that are near: of a wall in air 0.5, though a liquid lies between both in δ.
+    Errors: `InputError` if one of them has no surface.
     """
-    mesh = isosurface(occupancy.numpy(), grid, options.level, options.least_volume, options.smoothing)
-    vertices = torch.from_numpy(mesh.vertices / unit_length)
-    return SurfaceMesh(vertices, torch.from_numpy(mesh.faces), unit_length, matter)
+    vertices, faces, count = list[np.ndarray](), list[np.ndarray](), 0
+    for level in _levels(occupancy, [delta / matter.delta for delta, _ in matter.channels], options.level):
+        mesh = isosurface(occupancy.numpy() / level, grid, 1.0, options.least_volume, options.smoothing)
+        vertices.append(mesh.vertices / unit_length)
+        faces.append(mesh.faces + count)
+        count += len(mesh.vertices)
+    points, triangles = torch.from_numpy(np.concatenate(vertices)), torch.from_numpy(np.concatenate(faces))
+    return SurfaceMesh(points, triangles, unit_length, matter, parts=[len(part) for part in faces])
+
+
+def _levels(occupancy: Tensor, own: Sequence[float], share: float) -> Iterator[np.ndarray | float]:
+    """The occupancy, or that of each voxel, at which each material and all stronger ones end, those of levels `own`
+    falling: the `share` of the way between the weakest of them and the strongest of the others that are near.
+
+    A material but the first is near where it fills more than a layer (`told_apart`).
+    """
+    if len(own) == 1:
+        yield share * own[0]
+        return
+    filled = told_apart(occupancy, own, 1)[1:].numpy() > 0
+    near = [binary_dilation(each, iterations=NEAR) for each in filled]
+    for k in range(len(own)):
+        above, below = np.full(occupancy.shape, own[0]), np.zeros(occupancy.shape)
+        for j in range(1, k + 1):
+            above[near[j - 1]] = own[j]
+        for j in range(len(own) - 1, k, -1):
+            below[near[j - 1]] = own[j]
+        yield below + share * (above - below)
 
 
 def surface_fit(

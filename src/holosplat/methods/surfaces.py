@@ -18,7 +18,7 @@ from ..representations import GaussianCloud, Stored, SurfaceMesh
 from ..scan import Scan
 from .coarse import CoarseToFine, Way, begun_surfaces, coarse_surfaces, missing_matter, on_pixels, settled
 from .cross_validation import predicted_frames
-from .first_surfaces import is_noisy, surfaces_of_volume
+from .first_surfaces import first_surfaces, is_noisy, surfaces_of_volume
 from .gaussians import Gaussians, GaussianStage
 from .keeper import BY
 from .method import Method, Near, Stage, Task, quiet, run_quietly
@@ -83,7 +83,13 @@ class BodiesStage(GaussianStage):
         return Near(surfaces)
 
     def coarse_surfaces(self, task: Task, surfaces: SurfaceOptions) -> SurfaceMesh | None:
-        """Those of coarse pixels, which small frames have themselves; small noisy ones are for Gaussians."""
+        """Those of coarse pixels, which small frames have themselves; small noisy ones are for Gaussians, but those of
+        several known materials."""
+        if len(task.prior.materials) > 1 and self._small(task) and self._straight(task):
+            seen, how = self._without_validation(task), self.options.coarse
+            return begun_surfaces(
+                seen, lambda at: first_surfaces(at, self.options, surfaces, self.solved), surfaces, how
+            )
         straight = self._straight(task) and not is_noisy(task, self.options)
         return self.near_surfaces(task, surfaces) if straight or not self._small(task) else None
 

@@ -10,9 +10,10 @@ from torch import Tensor
 
 from ..backends import resolve
 from ..baselines.holographic_tv import agreed
+from ..baselines.two_materials import Shares, at_one_ratio
 from ..checks import InputError, require
 from ..geometry import Grid
-from ..matter import DeltaBeta, Matter
+from ..matter import Matter
 from ..representations import SurfaceMesh
 from .coarse import settled
 from .cross_validation import predicted_frames
@@ -50,8 +51,14 @@ def in_turns(task: Task, found: SurfaceMesh, options: GaussianOptions, surfaces:
 
 def _cut_again(task: Task, found: SurfaceMesh, options: GaussianOptions, surfaces: SurfaceOptions) -> SurfaceMesh:
     """Surfaces of the volume after rounds that began with the bodies of `found`."""
-    matter, start = DeltaBeta(found.matter.delta, found.matter.beta), _occupancy(task, found)
-    volume, grid = agreed(task.scan, matter, start, options.volume.in_noise(), task.on_progress, task.unlike_null)
+    grid = Grid.of_views(task.scan.views)
+    shares, first = found.shares(grid), found.matter.channels[0]
+    start = sum(float(each.delta / first.delta) * share for each, share in zip(found.matter.channels, shares))
+    scan, backend = task.scan, options.volume.backend
+    if found.matter.others:
+        scan = at_one_ratio(scan, Shares(shares.float().cpu(), grid, found.matter.channels), first.ratio, backend)
+    how = options.volume.in_noise()
+    volume, grid = agreed(scan, first, torch.as_tensor(start).float(), how, task.on_progress, task.unlike_null)
     return cut_as_seen(task, volume, grid, found.matter, surfaces)
 
 
@@ -69,12 +76,6 @@ def cut_as_seen(task: Task, volume: Tensor, grid: Grid, matter: Matter, surfaces
             tried.append((_left(task, cut, surfaces), cut))
     require(len(tried) > 0, "the volume holds no surface.")
     return min(tried, key=lambda one: one[0])[1]
-
-
-def _occupancy(task: Task, found: SurfaceMesh) -> Tensor:
-    """Of the surfaces' bodies, on voxels of a pixel."""
-    volume = found.voxelise(Grid.of_views(task.scan.views))
-    return torch.as_tensor(volume.delta / found.matter.delta, dtype=torch.float32)
 
 
 def _left(task: Task, found: SurfaceMesh, surfaces: SurfaceOptions) -> float:

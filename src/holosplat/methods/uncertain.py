@@ -11,7 +11,7 @@ import numpy as np
 
 from ..baselines.material import MaterialEstimate, estimate_ratio
 from ..checks import InputError, require
-from ..matter import DeltaBeta, Known, KnownRatio, KnownTwo, MaterialPrior
+from ..matter import DeltaBeta, Known, KnownRatio, KnownSeveral, MaterialPrior
 from ..ranges import ranged
 from ..scan import Scan
 from .method import Task, shows_no_refraction
@@ -165,9 +165,9 @@ def at_energy(prior: MaterialPrior, factor: float) -> MaterialPrior:
     """The same knowledge at `factor` times the energy."""
     if factor == 1:
         return prior
-    if isinstance(prior, Known | KnownTwo):
-        first, *rest = (DeltaBeta(m.delta * factor**-2, m.beta * factor**-4) for m in prior.materials)
-        return MaterialPrior.known(first, rest[0] if rest else None, prior.medium)
+    if isinstance(prior, Known | KnownSeveral):
+        there = (DeltaBeta(m.delta * factor**-2, m.beta * factor**-4) for m in prior.materials)
+        return MaterialPrior.known(*there, medium=prior.medium)
     return replace(prior, ratio=prior.ratio * factor**2) if isinstance(prior, KnownRatio) else prior
 
 
@@ -175,7 +175,7 @@ def _require_one(task: Task, uncertain: Uncertain) -> None:
     prior, exposures = task.prior, task.scan.exposures
     if uncertain.delta_beta is not None and prior.fixes_ratio and task.delta_told:
         raise InputError("delta_beta must be a range where the material is not known, but it is; leave one of them.")
-    require(len(prior.materials) < 2, "uncertain constants need one material, but two are known; leave the second.")
+    require(len(prior.materials) < 2, "uncertain constants need one material, but several are known; give one.")
     for name in ("distance", "energy_kev"):
         values = getattr(exposures, name)
         require(

@@ -117,7 +117,9 @@ class SmoothStage:
             least = LEFT * contrast_level(torch.from_numpy(scan.frames))
             noise, light = noise.at_least(least), light and replace(light, noise=light.noise.at_least(least))
         how = (options.prior, options.coarser, options.rounds, options.iterations, options.faint, options.loose)
-        return SmoothFit(SmoothPlan(scan, start, noise, task.prior.fixes_ratio, light, *how, backend))
+        return SmoothFit(
+            SmoothPlan(scan, start, noise, task.prior.fixes_ratio, light, *how, backend, task.prior.materials)
+        )
 
 
 def _beside(task: Task, start: VoxelGrid) -> Scan:

@@ -21,6 +21,9 @@ from ..volume import LineIntegrals
 MOST_SAMPLES = 1_000_000_000
 """Samples of all waves held at once, at most (16 GB as complex128)."""
 
+MOST_CHANNELS = 2
+"""Channels of matter that the kernels of the waves take; more are summed to δ and β first."""
+
 
 class Instrument:
     """The wave optics of some exposures, made ready: line integrals in, frames out, differentiable.
@@ -88,6 +91,8 @@ class Instrument:
         distance, psf_sigma_px: other distances [V] [m], on pixels of the views' pitch (`Exposures.optical`), and
         point-spread functions [V] [pixels] than those of the exposures, float64, with gradients if they require them.
         """
+        if len(lines.materials) > MOST_CHANNELS:
+            lines = LineIntegrals.of(*lines)
         chosen = None if index is None else torch.as_tensor(index, device=self.device)
         if distance is None and psf_sigma_px is None:
             path = self.path if chosen is None else self.path[chosen]

@@ -129,6 +129,8 @@ NAMES = {
 }
 """What a report is called, by the kind of object; others are called by what they say they are."""
 
+COUNTED = {1: "one", 2: "two", 3: "three", 4: "four"}
+
 
 def _guess(folder: RunFolder, reconstruction: Reconstruction) -> GuessShown | None:
     """What a network guessed, beside what was found; None where none was asked."""
@@ -161,7 +163,8 @@ def _scan_of(folder: RunFolder) -> str:
 def _title(config: Mapping[str, Any], reconstruction: Reconstruction) -> str:
     found = reconstruction.object
     matter, name = found.matter, NAMES.get(found.kind, f"Reconstruction as {found.described}")
-    count = "two materials" if matter.second else "one material" if matter.single else "δ and β free"
+    count = "δ and β free" if not matter.occupancies else f"{COUNTED.get(len(matter), len(matter))} material"
+    count += "s" if len(matter.others) else ""
     if not reconstruction.delta_told:
         return f"{name}, of absorption alone"
     said = {"known": ", known", "ratio": " of known δ/β", "free": ", found" if matter.occupancies else ""}

@@ -14,7 +14,7 @@ from ..volume import LineIntegrals, TrainableObject
 from .aligned_network import AlignedNetwork, PixelAligned
 from .flow import Fading, Flow, Lattice
 from .gaussians import GaussianCloud
-from .initialise import approximate, at_pitch, cloud_from_two, cloud_from_volume, freed, random_cloud
+from .initialise import approximate, at_pitch, cloud_from_shares, cloud_from_volume, freed, random_cloud
 from .isosurface import isosurface
 from .moving_gaussians import MovingGaussians
 from .moving_surfaces import MovingSurfaces
@@ -122,7 +122,7 @@ __all__ = [
     "VoxelLines",
     "approximate",
     "at_pitch",
-    "cloud_from_two",
+    "cloud_from_shares",
     "cloud_from_volume",
     "freed",
     "isosurface",

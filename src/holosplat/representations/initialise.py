@@ -69,32 +69,31 @@ def cloud_from_volume(
     )
 
 
-def cloud_from_two(
+def cloud_from_shares(
     occupancies: Tensor,
     grid: Grid,
-    materials: tuple[tuple[float, float], tuple[float, float]],
+    materials: Sequence[tuple[float, float]],
     spacing: float,
     unit_length: float,
     max_count: int = 1_000_000,
     filled: float = FILLED,
 ) -> GaussianCloud:
-    """A cloud of two materials that approximates `occupancies` [2, Z, Y, X] on `grid`; each Gaussian is of one.
+    """A cloud of materials that approximates `occupancies` [C, Z, Y, X] on `grid`; each Gaussian is of one.
 
-    The Gaussians of each are those of `cloud_from_volume`, with almost nothing of the other material. materials:
-    (δ, β) of each; the rest as there. Errors: `InputError` if there is nothing of one of them.
+    The Gaussians of each are those of `cloud_from_volume`, with almost nothing of the others. materials: (δ, β) of
+    each; the rest as there. Errors: `InputError` if there is nothing of one of them.
     """
     parts = []
     for channel, (occupancy, material) in enumerate(zip(occupancies, materials)):
-        which = ("denser", "lighter")[channel]
         require(
             bool((occupancy > filled).any()),
-            f"the start found nothing of the {which} of the two materials; check both, or name one only.",
+            f"the start found nothing of the material of δ {material[0]:.3g}; check all materials, or name fewer.",
         )
-        one = cloud_from_volume(occupancy, grid, material, spacing, unit_length, max_count // 2, filled)
-        raw = raw_of(torch.full((len(one), 2), NEXT_TO_NOTHING))
+        one = cloud_from_volume(occupancy, grid, material, spacing, unit_length, max_count // len(materials), filled)
+        raw = raw_of(torch.full((len(one), len(materials)), NEXT_TO_NOTHING))
         raw[:, channel] = one.raw_amplitudes[:, 0]
         parts.append((one.centres, one.log_scales, one.quaternions, raw))
-    return GaussianCloud([torch.cat(arrays) for arrays in zip(*parts)], unit_length, Matter.two(*materials))
+    return GaussianCloud([torch.cat(arrays) for arrays in zip(*parts)], unit_length, Matter.several(*materials))
 
 
 def at_pitch(volume: Tensor, grid: Grid, pitch: float) -> tuple[Tensor, Grid]:

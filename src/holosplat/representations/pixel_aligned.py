@@ -54,7 +54,7 @@ class PixelAlignedField:
     ) -> None:
         require(np.allclose(grid.voxel_size, grid.voxel_size[0]), "a pixel-aligned field needs a grid of cubic voxels.")
         require(
-            len(matter.channels) == 1 or (not matter.single and matter.second is None),
+            len(matter.channels) == 1 or not matter.occupancies,
             "a pixel-aligned field is of one material, or has δ and β free, but there are two; choose another method.",
         )
         wanted = (len(views), INPUTS, *views.shape)

@@ -1,8 +1,8 @@
-"""Closed deformable surfaces of one material, as an Object."""
+"""Closed deformable surfaces, one inside another where there are several materials, as an Object."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -20,23 +20,39 @@ from ..volume import LineIntegrals, Volume
 
 
 class SurfaceMesh:
-    """Closed triangle surfaces, filled with one material; the vertices are trainable.
+    """Closed triangle surfaces, filled with one material or several; the vertices are trainable.
 
     vertices: [P, 3] float64 `(x, y, z)` in units of `unit_length` [m], the scan's pixel size; faces: [F, 3] int64,
     counter-clockwise seen from the side without matter, so that an inner shell bounds a cavity. Bodies that overlap
-    add up. matter: the one material inside. lines: rows that are integrated in a pixel of a projection. Errors:
-    `InputError` if the arrays do not fit, or for more than one material.
+    add up. matter: what is inside: shares of materials, that of the strongest contrast first. parts: how many faces
+    belong to each of them (default: all to the one material), in their order. Those of a material enclose it and all
+    stronger ones, so that each closed surface is a step from one material to the next. lines: rows that are integrated
+    in a pixel of a projection. Errors: `InputError` if the arrays do not fit, or for free δ and β.
     """
 
     kind: ClassVar[str] = "surfaces"
     """The name of this kind of Object in files."""
     _repr_html_ = of_object
 
-    def __init__(self, vertices: Tensor, faces: Tensor, unit_length: float, matter: Matter, lines: int = 2) -> None:
+    def __init__(
+        self,
+        vertices: Tensor,
+        faces: Tensor,
+        unit_length: float,
+        matter: Matter,
+        lines: int = 2,
+        parts: Sequence[int] = (),
+    ) -> None:
         shapes = [tuple(vertices.shape), tuple(faces.shape)]
         fits = all(len(shape) == 2 and shape[1] == 3 for shape in shapes) and shapes[1][0] > 0
         require(fits, f"a surface needs vertices (P, 3) and at least one face (F, 3), but got {shapes}.")
-        require(matter.single, "surfaces are filled with one material, but two channels of matter are given.")
+        require(matter.occupancies, "surfaces are filled with materials, but δ and β of the matter are free.")
+        self.parts = tuple(int(count) for count in parts) or (len(faces),)
+        require(
+            len(self.parts) == len(matter) and min(self.parts) >= 0 and sum(self.parts) == len(faces),
+            f"parts must say how many of {len(faces)} faces belong to each of {len(matter)} materials, but it is "
+            f"{list(self.parts)}.",
+        )
         self.vertices, self.faces, self.lines = vertices, faces, lines
         self.unit_length, self.matter, self.backend = float(unit_length), matter, "cpu"
 
@@ -50,21 +66,28 @@ class SurfaceMesh:
         return self._with(vertices, self.faces, self.backend)
 
     def _with(self, vertices: Tensor, faces: Tensor, backend: str) -> SurfaceMesh:
-        surfaces = SurfaceMesh(vertices, faces, self.unit_length, self.matter, self.lines)
+        surfaces = SurfaceMesh(vertices, faces, self.unit_length, self.matter, self.lines, self.parts)
         surfaces.backend = backend
         return surfaces
+
+    @property
+    def steps(self) -> list[Tensor]:
+        """The faces [F, 3] of each material."""
+        return list(self.faces.split(self.parts))
 
     def state(self) -> dict[str, Any]:
         """Tensors and plain values that `from_state` makes the same surfaces of."""
         arrays = {"vertices": self.vertices, "faces": self.faces}
-        return {**arrays, "unit_length": self.unit_length, "lines": self.lines, "matter": self.matter.as_dict()}
+        several = {"parts": list(self.parts)} if len(self.parts) > 1 else {}
+        plain = {"unit_length": self.unit_length, "lines": self.lines, "matter": self.matter.as_dict()}
+        return {**arrays, **plain, **several}
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> SurfaceMesh:
         """The surfaces that `state` described; `InputError` where it does not fit together."""
         matter = Matter.from_dict(state["matter"])
         faces, unit = state["faces"].long(), positive("unit_length", state["unit_length"], "metres")
-        found = cls(state["vertices"], faces, unit, matter, int(state["lines"]))
+        found = cls(state["vertices"], faces, unit, matter, int(state["lines"]), state.get("parts", ()))
         last = len(found.vertices) - 1
         require(
             0 <= int(faces.min()) <= int(faces.max()) <= last,
@@ -102,25 +125,24 @@ class SurfaceMesh:
         """
         poses = Poses.of(views, self.vertices.device) if isinstance(views, Views) else views
         pitch = poses.pitch
-        thickness = surface_thickness(
-            self.vertices * (self.unit_length / pitch),
-            self.faces,
-            poses.rotations,
-            poses.shifts / pitch,
-            poses.shape,
-            self.lines,
-            self.backend,
-            pixels=poses.scales,
-            trusted=self.backend == "cuda" and not isinstance(views, Views),
-        )
-        return LineIntegrals(thickness[:, None], self.matter.in_lengths(pitch))
+        vertices = self.vertices * (self.unit_length / pitch)
+        placed = (poses.rotations, poses.shifts / pitch, poses.shape, self.lines, self.backend)
+        trusted = self.backend == "cuda" and not isinstance(views, Views)
+        enclosed = [
+            surface_thickness(vertices, faces, *placed, pixels=poses.scales, trusted=trusted) for faces in self.steps
+        ]
+        return LineIntegrals(_shares(enclosed, dim=1), self.matter.in_lengths(pitch))
 
     def voxelise(self, grid: Grid) -> Volume:
         """δ and β on `grid`, averaged over voxels."""
+        return self.matter.volume(self.shares(grid).cpu().numpy(), grid)
+
+    def shares(self, grid: Grid) -> Tensor:
+        """The share [C, Z, Y, X] of each voxel of `grid` that each material fills, float64."""
         voxel, offset = (self.vertices.new_tensor(a, dtype=torch.float64) for a in (grid.voxel_size, grid.origin))
         vertices = (self.vertices.detach() * self.unit_length - offset) / voxel
-        occupancy = surface_occupancy(vertices, self.faces, grid.shape).cpu().numpy()
-        return self.matter.volume(occupancy[None], grid)
+        enclosed = [surface_occupancy(vertices, faces, grid.shape) for faces in self.steps]
+        return _shares(enclosed, dim=0)
 
     def mesh(self, name: str = "surfaces") -> TriangleMesh:
         """All surfaces as one mesh [m]."""
@@ -145,6 +167,12 @@ class SurfaceMesh:
             smallest = max(range(len(outer)), key=lambda k: (around[k], k))  # outer ones are sorted by size
             members[smallest].append(cavity)
         return [_joined(parts, f"body{k:03d}") for k, parts in enumerate(members)]
+
+
+def _shares(enclosed: list[Tensor], dim: int) -> Tensor:
+    """What is of each material, along a new axis `dim`, by what its surfaces enclose: it and all before it."""
+    stronger = [torch.zeros_like(enclosed[0]), *enclosed[:-1]]
+    return torch.stack([one - less for one, less in zip(enclosed, stronger)], dim=dim)
 
 
 def _compact(mesh: TriangleMesh, faces: np.ndarray, name: str) -> TriangleMesh:

@@ -99,10 +99,10 @@ def prior_of(table: Mapping[str, Any]) -> MaterialPrior:
         if kind == "ratio":
             return MaterialPrior.of_ratio(float(table["ratio"]), sign)
         require(kind == "known", f"kind must be known, ratio or free, but it is {kind!r}.")
-        if "second_delta" not in table:
-            return MaterialPrior.known(first, medium=medium)
-        second = DeltaBeta(float(table["second_delta"]), float(table.get("second_beta", 0.0)))
-        return MaterialPrior.known(first, second, medium)
+        others = [DeltaBeta(float(delta), float(beta)) for delta, beta in table.get("others", ())]
+        if "second_delta" in table:  # of version 0.2
+            others.append(DeltaBeta(float(table["second_delta"]), float(table.get("second_beta", 0.0))))
+        return MaterialPrior.known(first, *others, medium=medium)
 
 
 WORD = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.,:+-]*")

@@ -34,7 +34,7 @@ MOST_VOXELS = 8_000_000
 @dataclass(frozen=True)
 class MaterialFound:
     """What a reconstruction says about the matter: mass-weighted medians of δ over its volume, and of δ/β in the
-    matter; or those of the one material, or the two (`second`: the lighter one's), that it is made of.
+    matter; or those of the material that it is made of, and of `others` of weaker contrast beside it.
 
     delta_told: whether prior or frames said what δ is; else `delta` stands for β; against: the medium that both are
     differences to, empty for vacuum.
@@ -43,7 +43,7 @@ class MaterialFound:
     delta: float
     ratio: float
     single_material: bool
-    second: DeltaBeta | None = None
+    others: tuple[DeltaBeta, ...] = ()
     delta_told: bool = True
     against: str = ""
 
@@ -109,8 +109,8 @@ class Evaluation(Scores):
             "delta_told": found.delta_told,
             **({"against": found.against} if found.against else {}),
         }
-        if found.second is not None:
-            material["second"] = _as_dict(found.second.delta, found.second.ratio)
+        if found.others:
+            material["others"] = [_as_dict(other.delta, other.ratio) for other in found.others]
         said: dict[str, Any] = {"light": self.light.in_words if self.light else "even"}
         said |= {} if self.verdict is None else {"verdict": self.verdict.as_dict()}
         return super().as_dict() | {"material": material} | said
@@ -125,8 +125,8 @@ class Evaluation(Scores):
             beta = f"material: β {found.delta / found.ratio:.3e}; δ is not told: the frames show absorption alone"
             return [*(line.replace("δ", "β") for line in super().lines()), *said, beta]
         kind = "one for all" if found.single_material else "found apart"
-        if found.second is not None:
-            kind = f"of two; the other: {_as_text(*found.second)}"
+        if found.others:
+            kind = f"of {1 + len(found.others)}; beside: {', '.join(_as_text(*other) for other in found.others)}"
         kind += f", against {found.against}" if found.against else ""
         return [*super().lines(), *said, f"material: {_as_text(found.delta, found.delta / found.ratio)} ({kind})"]
 
@@ -270,10 +270,10 @@ def known(predicted: np.ndarray, measured: Scan) -> np.ndarray:
 
 
 def material_found(found: Stored) -> MaterialFound:
-    """What the object, where δ and β are free, says about the matter; what it is made of for one material or two."""
+    """What the object, where δ and β are free, says about the matter; or the materials that it is made of."""
     matter = found.matter
     if matter.occupancies:
-        return MaterialFound(matter.delta, matter.channels[0].ratio, matter.single, matter.second)
+        return MaterialFound(matter.delta, matter.channels[0].ratio, matter.single, matter.others)
     volume = found.voxelise(found.enclosing_grid(MOST_VOXELS))
     sign = matter.channels[0].sign
     delta, beta = (sign * values.ravel().astype(np.float64) for values in (volume.delta, volume.beta))

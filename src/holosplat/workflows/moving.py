@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from ..checks import require
 from ..fit.residuals import Prediction
-from ..matter import KnownTwo, MaterialPrior
+from ..matter import KnownSeveral, MaterialPrior
 from ..methods import Task
 from ..methods.assumed import assumed_material
 from ..methods.illumination import prepared
@@ -62,7 +62,9 @@ def reconstruct_moving(
     for bit, as if nothing had happened. Errors: `InputError` for a scan of one or two times, frames that are not
     relative to the flat field, two materials, and folders that do not fit.
     """
-    require(not isinstance(prior, KnownTwo), "a flow carries one material, but two are known; leave --second-material.")
+    require(
+        not isinstance(prior, KnownSeveral), "a flow carries one material, but several are known; give --material once."
+    )
     train = scan.train()
     count = len(train.instants)
     require(

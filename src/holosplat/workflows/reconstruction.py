@@ -43,7 +43,6 @@ def summary_of(done: Reconstruction, fit: Running | None, train: Scan) -> dict[s
     """Entries of summary.json; fit: the last one, if there was any."""
     (h, w), matter = train.views.shape, done.object.matter
     backend = fit.backend if fit else done.object.backend
-    second = matter.second and {"delta": matter.second.delta, "beta": matter.second.beta}
     return {
         "finished": done.finished,
         "method": done.method,
@@ -67,7 +66,7 @@ def summary_of(done: Reconstruction, fit: Running | None, train: Scan) -> dict[s
             "single": matter.single,
             "delta_told": done.delta_told,
         },
-        "second_material": second,
+        "other_materials": [each._asdict() for each in matter.others],
         "timing_s": done.timing,
         "constants": [to_table(each) for each in done.constants],
         **({"verdict": done.verdict.as_dict()} if done.verdict else {}),

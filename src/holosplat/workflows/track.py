@@ -13,7 +13,7 @@ from ..io.atomic import write_rows
 from ..io.folder import atomic_folder
 from ..io.pvd import TimeStep, write_pvd
 from ..io.vtk import write_mesh
-from ..matter import KnownTwo, MaterialPrior
+from ..matter import KnownSeveral, MaterialPrior
 from ..methods import Task
 from ..methods.assumed import assumed_material
 from ..methods.illumination import prepared
@@ -86,7 +86,9 @@ def track(
         >>> print(f"{(last - first)[1] / times[-1]:.2f} m/s")
         0.05 m/s
     """
-    require(not isinstance(prior, KnownTwo), "bodies are of one material, but two are known; leave --second-material.")
+    require(
+        not isinstance(prior, KnownSeveral), "bodies are of one material, but several are known; give --material once."
+    )
     require_times(scan.train())
     check_frames(scan.train())
     assumed = light or LightOptions()
