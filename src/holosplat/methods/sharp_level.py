@@ -32,9 +32,9 @@ def material_of_levels(task: Task, backend: Backend = "auto", options: MaterialE
     if not (task.bounded and isinstance(task.prior, KnownRatio)):
         return material
     task.on_progress(STAGE, 0.0)
-    task = in_few_views(task)
+    few = in_few_views(task)
     stage = SmoothStage(SmoothVolume(estimate=options, max_voxels=EDGE**3, rounds=1, faint=0.0))
-    fit = stage.fit(task, stage.start(task, None))
+    fit = stage.fit(few, stage.start(few, None))
     fit.run(lambda record: task.on_progress(STAGE, fit.share))
     found = fit.voxels
     values = found.values[0]

@@ -45,12 +45,12 @@ class Costs:
     """All of it while a run is judged and its report drawn."""
     frames: float = 24.0
     """A pixel of a frame: itself, and copies that are corrected, evened and compared."""
-    fine: float = 61.0
+    fine: float = 63.0
     """A voxel of the rounds of agreement: the volume, its dual, and what both are extrapolated to."""
     coarse: float = 22.0
     """A voxel of one pixel beside these."""
-    rays: float = 450.0
-    """A voxel of a slice that a view crosses: the sparse slice matrix, its transpose, and what both are made of."""
+    rays: float = 60.0
+    """A voxel of a slice that a view crosses: the transposed slice matrix, and the parts that it is made of."""
     smooth: float = 255.0
     """A voxel of a smooth volume: six pairs of L-BFGS, gradients and priors."""
     plain: float = 52.0
