@@ -311,8 +311,6 @@ class SmoothFit:
         """u with what the prior has taken: the edges' way between rounds, the total's at the end. Low frequencies see
         the total by its absorption, so where δ/β was estimated they are no better than the others."""
         last = self._leg == len(self._legs) - 1
-        if last and self.plan.known:
-            return u
         told = last and self.plan.ratio_known
         return unshrunk(problem, u, self.plan.light is not None) if told else modulated(problem, u)
 

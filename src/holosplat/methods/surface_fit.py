@@ -151,7 +151,7 @@ def _levels(occupancy: Tensor, own: Sequence[float], share: float) -> Iterator[n
         yield share * own[0]
         return
     filled = told_apart(occupancy, own, 1)[1:].numpy() > 0
-    near = [binary_dilation(each, iterations=NEAR) for each in filled]
+    near = [np.asarray(binary_dilation(each, iterations=NEAR), dtype=bool) for each in filled]
     for k in range(len(own)):
         above, below = np.full(occupancy.shape, own[0]), np.zeros(occupancy.shape)
         for j in range(1, k + 1):
