@@ -13,7 +13,7 @@ from holosplat.beamline.simulate import simulate
 from holosplat.geometry import Views
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import SmoothVolume, Task
-from holosplat.methods.first_volumes import BY_FISSION, Folds
+from holosplat.methods.first_volumes import BY_FISSION, BY_VIEWS, Folds
 from holosplat.methods.illumination import STAGE, prepared
 from holosplat.optics.background import Background, LightOptions
 from holosplat.scan import Exposures, Scan
@@ -66,23 +66,27 @@ def test_even_light_is_left_alone(family, request):
     assert task.scan is request.getfixturevalue(family)
 
 
-@pytest.mark.parametrize("family", ["soft", "sharp"])
-def test_uneven_light_is_found(family, request):
-    scan = lit(request.getfixturevalue(family), uneven())
-    task = prepared(Task(scan, PRIOR))
+@pytest.fixture(scope="module", params=["soft", "sharp"])
+def in_uneven_light(request) -> tuple[str, Task]:
+    scan = lit(request.getfixturevalue(request.param), uneven())
+    return request.param, prepared(Task(scan, PRIOR), SmoothVolume())
+
+
+def test_uneven_light_is_found(in_uneven_light):
+    family, task = in_uneven_light
+    first = [each for each in task.decisions if each.name == STAGE and each.by == BY_VIEWS]
+    assert "uneven light" in first[-1].choice
     assert task.uneven is not None
     if family == "sharp":  # soft matter leaves next to no air, so that the light is known badly, and still is better
-        off = task.lit.factor().numpy() / uneven()  # type: ignore[union-attr]
+        off = task.lit.factor().numpy() / uneven()
         assert float(off.std()) < 0.2 * float(uneven().std())
 
 
-@pytest.mark.parametrize("family", ["soft", "sharp"])
-def test_fits_confirm_uneven_light(family, request):
-    task = prepared(Task(lit(request.getfixturevalue(family), uneven()), PRIOR), SmoothVolume())
+def test_fits_confirm_uneven_light(in_uneven_light):
+    _, task = in_uneven_light
     last = [each for each in task.decisions if each.name == STAGE][-1]
     assert last.by == "views set aside, by fits"
     assert "uneven light" in last.choice
-    assert task.uneven is not None
 
 
 def test_fits_refuse_what_steadies_first_volumes(soft, monkeypatch):
