@@ -14,7 +14,6 @@ from ..checks import InputError, require
 from ..ranges import Frequency, Natural, Signed, Small, ranged
 from ..tables import LARGEST, from_table, number_in, shown, to_table
 from .angles import read_angles, tell_angles, tell_views
-from .half_acquisition import stitched
 from .tube import Tube
 
 if TYPE_CHECKING:
@@ -195,7 +194,10 @@ class Reading:
         joined: whether opposite frames of a half acquisition become wider ones (`stitched`).
         """
         scan = self.told.placed(scan)
-        scan = stitched(scan) if joined else scan
+        if joined:
+            from .half_acquisition import stitched  # SciPy, without which help is printed
+
+            scan = stitched(scan)
         tell_views(scan)
         return self.part.of(scan if self.told.tube is None else Tube.parsed(self.told.tube).taken_out_of(scan))
 
