@@ -317,7 +317,7 @@ class PriorOptions:
     material: UseAppendAction[tuple[str, ...]] = ()
     """Formula or name of the material, if known (then δ and β are); again for each further one."""
     density: UseAppendAction[tuple[Grams, ...]] = ()
-    """Density of each formula [g/cm³], in their order; or of every material."""
+    """Density of each formula [g/cm³], in their order."""
     medium: str | None = None
     """Formula or name of what surrounds them; none means vacuum."""
     medium_density: Grams | None = None
