@@ -19,7 +19,7 @@ LEAST_COUNTS = 1.0
 MOST_DEFECTS = 0.2
 """A larger share of defective pixels is no camera to reconstruct from."""
 FILLED = "are filled from their neighbours, and have no weight"
-"""What is said of pixels that have no value of their own."""
+"""End of warnings about pixels that have no value of their own."""
 NORMAL_MEDIAN = 0.6745
 """The median of |x| for a standard normal x."""
 
@@ -83,10 +83,9 @@ class PixelRepair:
 
 def filled(label: str, frames: np.ndarray, found: np.ndarray, mask: np.ndarray, numbers: np.ndarray) -> Taken:
     """Frames [K, H, W] whose pixels `found` [K, H, W], and those of the `mask` [H, W] or [K, H, W], are filled from
-    their neighbours, and which pixels these are.
+    their neighbours, and which pixels these are; numbers: [K] of the frames.
 
-    The number of those found is said; numbers: [K] of the frames. Errors: `InputError` for a frame with more than a
-    part `MOST_DEFECTS` of them.
+    A warning gives the number of those found. Errors: `InputError` for a frame with more than a part `MOST_DEFECTS`.
     """
     if found.any():
         shares, count = found.mean(axis=(1, 2)), int(found.any(axis=(1, 2)).sum())
