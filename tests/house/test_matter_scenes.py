@@ -51,7 +51,7 @@ def test_bubbles_are_no_holes_of_the_material(script):
     assert script.judged(drawn.scene.voxelise(grid), drawn, grid) == (0, 1, 1, "")
 
 
-@pytest.mark.parametrize(("name", "materials"), [("jet", 1), ("cuvette", 2), ("channel", 1), ("shock", 0)])
+@pytest.mark.parametrize(("name", "materials"), [("jet", 1), ("cuvette", 2), ("channel", 2), ("shock", 0)])
 def test_runs_get_the_materials_of_the_scene(script, name, materials):
     substances, drawn, _ = script.planned(name, "small", 1)
     made = script.Scene(None, substances, drawn, name == "shock")
