@@ -125,6 +125,8 @@ def test_colours_end_where_values_do():
     """Whole numbers go a step beyond: of matter lighter than its medium the bar began above zero."""
     lighter = volume_part(replace(LUMP, delta=-LUMP.delta, beta=-LUMP.beta), RASTER, 10**9)
     assert lighter.facts["ends"] == [(-LUMP.delta.max(), 0.0)]
+    rounded = volume_part(replace(LUMP, delta=LUMP.delta - 1e-15 * LUMP.delta.max()), RASTER, 10**9)
+    assert rounded.facts["ends"][0][0] == 0
 
 
 def test_a_volume_is_binned_until_it_fits():

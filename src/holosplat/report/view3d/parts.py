@@ -86,12 +86,18 @@ def _voxels(volume: Volume, pixel: float) -> ViewPart:
         {
             "low": [low for _, low, _ in stored],
             "step": [step for _, _, step in stored],
-            "ends": [(float(v.min(initial=0.0)), float(v.max(initial=0.0))) for v in values],
+            "ends": [_ends(v, step) for v, (_, _, step) in zip(values, stored)],
             "voxel": [float(size) / pixel for size in grid.voxel_size],
             "middle": [float(c) / pixel for c in grid.centre],
         },
         channels,
     )
+
+
+def _ends(values: np.ndarray, step: float) -> tuple[float, float]:
+    """The least and the greatest value, with 0; what is less than a stored `step` off 0 is rounding."""
+    low, high = float(values.min(initial=0.0)), float(values.max(initial=0.0))
+    return (low if -low >= step else 0.0), (high if high >= step else 0.0)
 
 
 def binned(volume: Volume, factor: int) -> Volume:
