@@ -25,6 +25,17 @@ def test_a_choice_is_the_best_of_all():
     np.testing.assert_array_equal(found, choices[costs.argmin()].astype(bool))
 
 
+def test_equal_candidates_are_not_exchanged_for_ever():
+    """Rounding makes each of two equal candidates better than the other by 1e-12."""
+    r = np.random.default_rng(0)
+    shadows = r.random((int(r.integers(4, 9)), 5)).astype(np.float32)
+    shadows = np.concatenate([shadows, shadows[:3], shadows[:2]])
+    products = (shadows @ shadows.T).astype(float) / 0.013**2
+    gains = shadows @ shadows[:3].sum(axis=0) / 0.013**2 - 0.1
+    found = best_choice(products, gains)
+    assert 0.5 * found @ products @ found - gains @ found < 0
+
+
 def test_the_best_of_several_tries_are_put_together():
     """Each try has one body right and one astray; the pool has them all."""
     truth = [pose(TURN, (6.0, 0.0, -5.0)), pose(OTHER, (-6.0, 1.0, 5.0), 1.2)]

@@ -167,8 +167,13 @@ def best_choice(products: np.ndarray, gains: np.ndarray) -> np.ndarray:
 
 
 def _improved(products: np.ndarray, gains: np.ndarray, x: np.ndarray) -> tuple[float, np.ndarray]:
-    """The value of the choice that single changes lead to from `x` [C], and that choice."""
+    """The value of the choice that single changes lead to from `x` [C], and that choice.
+
+    A change by less than rounding is none: equal candidates would be put in for each other for ever.
+    """
     own = 0.5 * np.diag(products)
+    largest = max(float(np.abs(products).max(initial=0.0)), float(np.abs(gains).max(initial=0.0)))
+    rounding = 4 * len(gains) * np.finfo(float).eps * largest
     while True:
         slope = products @ x - gains
         flips, inside, outside = np.where(x, own - slope, own + slope), np.flatnonzero(x), np.flatnonzero(~x)
@@ -179,7 +184,7 @@ def _improved(products: np.ndarray, gains: np.ndarray, x: np.ndarray) -> tuple[f
             out, into = np.unravel_index(int(swaps.argmin()), swaps.shape)
             if swaps[out, into] < change:
                 change, gone = float(swaps[out, into]), [int(inside[out]), int(outside[into])]
-        if change >= 0:
+        if change >= -rounding:
             return float(0.5 * x @ products @ x - gains @ x), x
         x = x.copy()
         x[gone] = ~x[gone]
