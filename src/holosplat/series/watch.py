@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import socket
 import time
@@ -60,7 +61,7 @@ class WatchFolder:
 
     def begin(self, said: dict[str, Any]) -> None:
         """Begin with what is `said` of the watch, or go on; `InputError` where it was begun otherwise."""
-        wanted = {"format": FORMAT, **said}
+        wanted = json.loads(json.dumps({"format": FORMAT, **said}))  # as it is read again: lists for tuples
         if not self.marker.is_file():
             write_json(self.marker, wanted)
             (self.path / SCANS).mkdir(exist_ok=True)
