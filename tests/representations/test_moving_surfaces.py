@@ -212,6 +212,6 @@ def test_what_does_not_fit_is_refused():
         body.with_parameters({"coefficients": body.coefficients * torch.nan})
     with pytest.raises(InputError, match="name vertices"):
         MovingSurfaces.from_state(body.state() | {"faces": body.faces + 1})
-    with pytest.raises(InputError, match="one material"):
+    with pytest.raises(InputError, match="δ and β of the matter are free"):
         MovingSurfaces(body.coefficients, body.faces, body.of_body, BASIS, PITCH, Matter.free(3e-7, 2e-10))
     assert replace(BASIS, pieces=3).count == 5

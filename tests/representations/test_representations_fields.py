@@ -305,7 +305,8 @@ CUBE = Grid.centred((3, 3, 3), 1.0)
         (lambda: Encoding(coarsest=1.0, finest=2.0), "finest must lie between"),
         (lambda: Encoding(bandwidth=0.0), "bandwidth must be positive"),
         (lambda: Network(hidden=0), "hidden must be at least 1"),
-        (lambda: Matter(((1.0, 0.0),) * 3), "matter must have one or two channels, but it has 3"),  # type: ignore[arg-type]
+        (lambda: Matter(()), "matter must have a channel at least, but it has none"),
+        (lambda: Matter(((1.0, 0.0),) * 3, occupancies=False), "have a channel each, but matter has 3"),  # type: ignore[arg-type]
         (lambda: NeuralField(CUBE, Matter.one(0.0, 0.0), SMALL, torch.ones(3, 3, 3)), "matter with a δ"),
         (lambda: NeuralField(CUBE, ONE, SMALL, torch.ones(3, 3, 3), upper=-1.0), "upper must not be negative"),
         (lambda: NeuralField(CUBE, ONE, SMALL, torch.ones(2, 3, 3)), "mask"),
