@@ -10,12 +10,13 @@ from scipy.ndimage import gaussian_filter
 from holosplat.beamline.light import correlated_field
 from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
+from holosplat.frames import binned
 from holosplat.geometry import Views
 from holosplat.matter import DeltaBeta
 from holosplat.model import SolvedLight
 from holosplat.optics.background import Background, Light, LightOptions
 from holosplat.optics.noise_model import NoiseModel
-from holosplat.scan import Exposures, binned
+from holosplat.scan import Exposures
 from holosplat.specimens.soft_matter import round_cell
 
 SHAPES = [(5, 72, 72), (4, 61, 90)]
