@@ -14,10 +14,14 @@ from helpers.runs import KNOWN, SMALL
 from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
+from holosplat.inference import Score
 from holosplat.matter import DeltaBeta, MaterialPrior, Matter
 from holosplat.methods import Auto, Gaussians, Method, Task, settled
 from holosplat.methods.cross_validation import MissingMatter
-from holosplat.methods.levels import CONTINUOUS, LEVELS, decide_matter, flattened
+from holosplat.methods.levels import CONTINUOUS, LEVELS, TrialFits, decide_matter, flattened
+from holosplat.methods.trials import first_of_task, plain_light
+from holosplat.methods.uncertain import Determined
+from holosplat.optics.background import LightOptions
 from holosplat.representations import Stored, VoxelGrid
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.red_cells import random_cells
@@ -121,6 +125,40 @@ def test_fits_alone_overturn_a_known_material(soft):
     for levels, continuous, choice in ((near, near, "one level"), (far, near, CONTINUOUS), (near, far, "one level")):
         found = decide_matter(task, {"levels": levels, "continuous": continuous})
         assert (found.choice, found.by) == (choice, "views set aside, by fits")
+
+
+def test_fits_must_win_in_every_fold(soft, monkeypatch):
+    """Continuous matter explains the first two unseen views ten times better, and the others worse."""
+
+    def score(fits, name, kind, fold, two=False) -> Score:
+        power = 1.0 if kind == "levels" else 0.01 if fold == 0 else 100.0
+        return Score(np.full((8, 3), power), 2)
+
+    monkeypatch.setattr(TrialFits, "score", score)
+    methods = {"levels": Auto().gaussians, "continuous": Auto().volume}
+    found = decide_matter(Task(soft, MaterialPrior.known(MATERIAL)), methods)
+    assert (found.choice, found.by) == ("one level", "views set aside, by fits")
+
+
+@pytest.mark.parametrize(("is_lit", "ratio"), [(True, 777.0), (False, 333.0)])
+def test_kinds_are_compared_at_the_likeliest_ratio(soft, monkeypatch, is_lit, ratio):
+    """Where none is known; before light is decided, at that of the first volume."""
+    seen, grid = list[float](), Grid.of_views(soft.views)
+    frames = torch.from_numpy(soft.frames)
+    task = Task(soft, MaterialPrior.unknown(), lit=plain_light(frames, LightOptions()) if is_lit else None)
+    first = first_of_task(task)
+    first._material = DeltaBeta(MATERIAL.delta, MATERIAL.delta / 333.0)
+
+    def fitted(method, task) -> VoxelGrid:
+        seen.append(task.prior.ratio)
+        return VoxelGrid(torch.zeros((1, *grid.shape)), grid, Matter.one(*MATERIAL))
+
+    place = import_module("holosplat.methods.levels")
+    likeliest = Determined("delta_beta", 777.0, 700.0, 800.0, (1.0, 1e6), True, "")
+    monkeypatch.setattr(place, "likeliest_ratio", lambda task: likeliest)
+    monkeypatch.setattr(place, "solve_stages", fitted)
+    TrialFits(task, first, {"continuous": Auto().volume}).score("as measured", "continuous", 0)
+    assert seen == [pytest.approx(ratio)]
 
 
 def test_too_few_views_are_said(sharp):
