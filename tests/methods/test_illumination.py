@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from holosplat.baselines import holographic_tv
 from holosplat.beamline.light import UnevenLight, correlated_field
 from holosplat.beamline.simulate import simulate
 from holosplat.geometry import Views
@@ -15,6 +16,7 @@ from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import SmoothVolume, Task
 from holosplat.methods.first_volumes import BY_FISSION, BY_VIEWS, Folds
 from holosplat.methods.illumination import STAGE, prepared
+from holosplat.methods.trials import first_of_task, plain_light
 from holosplat.optics.background import Background, LightOptions
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.red_cells import random_cells
@@ -162,6 +164,16 @@ def test_two_views_are_judged_by_data_fission(soft):
     assert torch.allclose(0.5 * (first + second), torch.from_numpy(few.frames), atol=1e-6)
     assert float((first - second).std()) > 0
     assert all("fixed pattern" not in each for each in choices(few))
+
+
+def test_folds_share_phase_retrieval(sharp):
+    """A volume is the same as by retrieval of its own views alone."""
+    task = Task(sharp, MaterialPrior.known(MATTER))
+    first = first_of_task(task)
+    seen, _ = first.folds.split(1)
+    light = plain_light(torch.from_numpy(seen.frames), task.light)
+    alone, _ = holographic_tv(seen, MATTER, first.options, task.on_progress, light)
+    assert torch.equal(first.volume(1, light).values[0], alone)
 
 
 def test_folds_share_no_view(soft):
