@@ -53,6 +53,13 @@ class MissingError(InputError, RuntimeError):
     """A required package is not installed; the message names it, and the ways out."""
 
 
+class NoMatterError(InputError):
+    """Frames show no matter where a volume or a start needs some."""
+
+    def __init__(self) -> None:
+        super().__init__("the start found no matter in the holograms; check material, energy and distance.")
+
+
 def note(text: str) -> None:
     """Say what was found in the input: on standard error of a command, in Python by the logger `holosplat`."""
     logging.getLogger("holosplat").info(text)

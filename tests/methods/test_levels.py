@@ -12,7 +12,7 @@ import torch
 
 from helpers.runs import KNOWN, SMALL
 from holosplat.beamline.simulate import simulate
-from holosplat.checks import InputError
+from holosplat.checks import InputError, NoMatterError
 from holosplat.geometry import Grid, Views
 from holosplat.inference import Score
 from holosplat.matter import DeltaBeta, MaterialPrior, Matter
@@ -161,6 +161,22 @@ def test_kinds_are_compared_at_the_likeliest_ratio(soft, monkeypatch, is_lit, ra
     assert seen == [pytest.approx(ratio)]
 
 
+def test_a_fit_that_finds_no_matter_predicts_frames_without_any(soft, monkeypatch):
+    """It is a candidate that explains nothing, not the end of a run."""
+    place = import_module("holosplat.methods.levels")
+    task = Task(soft, RATIO, lit=plain_light(torch.from_numpy(soft.frames), LightOptions()))
+    first = first_of_task(task)
+
+    def nothing(method, task):
+        raise NoMatterError
+
+    monkeypatch.setattr(place, "solve_stages", nothing)
+    found = TrialFits(task, first, {"levels": Auto().gaussians}).score("as measured", "levels", 0)
+    unseen = first.folds.split(0)[1]
+    empty = Score.of(unseen.left(torch.ones(unseen.frames.shape, dtype=torch.float64)))
+    np.testing.assert_allclose(found.powers, empty.powers)
+
+
 def test_too_few_views_are_said(sharp):
     assert "too few views" in decide_matter(Task(sharp[[0, 4]], RATIO)).by
 
@@ -209,6 +225,17 @@ def test_flat_volumes_keep_their_rims_and_their_mass():
     assert torch.isclose(one.sum(), values.sum())
     assert one[inside].unique().numel() == 1
     assert list(flattened(torch.zeros(9, 9, 9).index_fill(0, torch.tensor([4]), 1.0), 1)) == []
+
+
+@pytest.mark.parametrize("rows", [1, 2])
+def test_a_volume_of_few_rows_has_an_inside(rows):
+    """Matter goes on above and below frames of few rows, as of a tooth."""
+    disc = torch.zeros(13, rows, 17)
+    disc[2:11, :, 3:13] = 1.0
+    disc[4:9, :, 5:9] = 0.6
+    one, two = flattened(disc, 1)
+    assert (one != disc).any()
+    torch.testing.assert_close(two, disc)
 
 
 def test_missing_matter_counts_what_is_absent(sharp):

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..backends import Backend, resolve
-from ..checks import at_least, require
+from ..checks import NoMatterError, at_least, require
 from ..geometry import Grid
 from ..memory import memory_kept
 from ..optics.retrieval import paganin
@@ -21,7 +21,6 @@ from .tomography import TotalVariation, tv_solver
 
 TRIAL_DELTA = 1e-6
 """Any size will do: the retrieved D = δT does not depend on it."""
-NO_MATTER = "the start found no matter in the holograms; check material, energy and distance."
 
 
 @dataclass(frozen=True)
@@ -74,7 +73,8 @@ def estimate_ratio(
         on_progress("estimate of delta/beta", i / len(ratios))
         trial = _trial_volume(coarse, ratio, backend, options, sign)
         levels[i] = plateau(trial) if bool((trial > 0).any()) else 0.0  # a wrong ratio may leave nothing
-    require(bool(levels.any()), NO_MATTER)
+    if not bool(levels.any()):
+        raise NoMatterError
     best = _first_peak(levels)
     left, middle, right = levels[best - 1 : best + 2]
     curvature = left - 2 * middle + right
@@ -108,7 +108,8 @@ def estimate_delta(
 def plateau(occupancy: Tensor) -> float:
     """The level [units of `occupancy`] that most of the matter has: the mass-weighted median of [Z, Y, X] ≥ 0."""
     values = occupancy[occupancy > 0].sort().values
-    require(len(values) > 0, NO_MATTER)
+    if not len(values):
+        raise NoMatterError
     mass = values.double().cumsum(0)
     return float(values[int(torch.searchsorted(mass, 0.5 * mass[-1]))])
 

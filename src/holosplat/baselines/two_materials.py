@@ -16,7 +16,7 @@ from itertools import pairwise
 
 import numpy as np
 import torch
-from scipy.ndimage import binary_opening, gaussian_filter, gaussian_gradient_magnitude
+from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter, gaussian_gradient_magnitude
 from scipy.optimize import nnls
 from torch import Tensor
 from torch.nn.functional import avg_pool3d
@@ -143,10 +143,17 @@ def told_apart(delta: Tensor, levels: Sequence[float], pixel: int, options: TwoM
     """
     values = delta.numpy()
     edges = [0.5 * (level + below) for level, below in zip(levels, [*levels[1:], 0.0])]
-    lighter = [binary_opening((values > low) & (values <= high), iterations=pixel) for high, low in pairwise(edges)]
+    between = ((values > low) & (values <= high) for high, low in pairwise(edges))
+    lighter = [binary_dilation(eroded(inside, pixel), iterations=pixel) for inside in between]
     densest = np.where(np.any(lighter, axis=0), 0, np.clip(values / levels[0], 0, 1))
     densest[densest < options.sliver] = 0
     return torch.from_numpy(np.stack([densest, *lighter]).astype(np.float32))
+
+
+def eroded(inside: np.ndarray, steps: int) -> np.ndarray:
+    """`inside` [Z, Y, X] bool without its voxels that are `steps` or fewer from outside; matter goes on beyond the
+    volume, so that a volume of few rows has an inside, too."""
+    return np.asarray(binary_erosion(inside, iterations=steps, border_value=1), dtype=bool)
 
 
 def absorption(

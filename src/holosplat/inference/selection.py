@@ -15,6 +15,8 @@ ERRORS = 2.0
 """Standard errors of the paired difference by which a candidate must predict better than the null."""
 MARGIN = 0.02
 """Part of the residual that it must take away at least: less is no improvement in practice."""
+LEAST = -math.log1p(-MARGIN)
+"""The same as a gain."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +39,13 @@ class Compared:
         return self.gain < -self._sure
 
     @property
+    def large(self) -> bool:
+        """Whether the gain is of practical size, sure or not."""
+        return self.gain > LEAST
+
+    @property
     def _sure(self) -> float:
-        return max(ERRORS * self.error, -math.log1p(-MARGIN))
+        return max(ERRORS * self.error, LEAST)
 
 
 @dataclass(frozen=True)
@@ -90,10 +97,10 @@ def select(
     """The candidate that predicts unseen frames best, by the policy of `Compared.wins`.
 
     candidates: the null first, then from simple to complex; score: of a candidate on the unseen frames of a fold, kept
-    by the caller; folds: how many there are. Folds are looked at one after another, as long as the candidate wins; it
-    is taken only if it wins over all of them, where the frames, and not their blocks, give the standard error: frames
-    differ by more than their parts do. by: how unseen frames came about; beside: other names that a candidate must win
-    against, too.
+    by the caller; folds: how many there are. Folds are looked at one after another, as long as the gain is of practical
+    size; a candidate is taken only if it wins over all of them, where the frames, and not their blocks, give the
+    standard error: frames differ by more than their parts do. by: how unseen frames came about; beside: other names
+    that a candidate must win against, too.
     """
     require(len(candidates) > 0, "a selection needs at least one candidate, but there is none.")
     began, best, compared = time.perf_counter(), candidates[0], list[Compared]()
@@ -101,7 +108,7 @@ def select(
         rivals = (best, *(beside or {}).get(candidate, ()))
         found = _least(candidate, rivals, score, range(1))
         for last in range(1, folds):
-            if found.wins:
+            if found.large:
                 found = _least(candidate, rivals, score, range(last + 1))
         compared.append(found)
         if found.wins:

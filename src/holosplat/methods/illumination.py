@@ -68,7 +68,11 @@ def confirmed(task: Task, first: FirstVolumes, told: Hypothesis) -> Decision:
     candidates = [name_of(first.taken[:count]) for count in (*counts, len(first.taken))]
     beside = {name_of(first.taken[: n + 1]): rivals(first.taken[:n], first.taken[n]) for n in counts}
     by = f"{first.folds.by}, by fits"
-    return select(STAGE, candidates, lambda name, fold: fits.score(name, "continuous", fold), by=by, beside=beside)
+
+    def scored(name: str, fold: int) -> Score:
+        return fits.score(name, "continuous", fold)
+
+    return select(STAGE, candidates, scored, first.folds.count, by=by, beside=beside)
 
 
 def prepared(task: Task, method: Method | None = None, before: Prepared | None = None) -> Task:

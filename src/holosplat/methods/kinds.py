@@ -5,11 +5,13 @@ Training frames prefer the freer kind, which also explains by half a density wha
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from functools import cache, partial
 
 import torch
 
+from ..checks import NoMatterError
 from ..inference import Decision, Score, select
 from ..representations import Stored
 from ..scan import Scan
@@ -55,8 +57,10 @@ def decide_kind(task: Task, method: Method, null: str, other: str) -> Decision:
         lit = task.lit and task.lit.part(torch.from_numpy(folds.kept(fold)), folds.binning)
         last = _LastOfEachKind()
         part = replace(task, scan=seen, lit=lit, first=None, near=False, on_start=unheard)
-        run_stages(method.with_effort(EFFORT), part, last)
+        with suppress(NoMatterError):  # what is made before it stands
+            run_stages(method.with_effort(EFFORT), part, last)
         expected = {kind: predicted_frames(unseen.exposures, *state) for kind, state in last.states.items()}
+        expected = expected or {null: torch.ones(unseen.frames.shape)}
         return {kind: Score.of(unseen.left(frames.double())) for kind, frames in expected.items()}
 
     def score(kind: str, fold: int) -> Score:

@@ -13,11 +13,11 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from scipy.ndimage import binary_erosion
 from torch import Tensor
 
 from ..baselines.material import plateau
-from ..baselines.two_materials import best_levels, told_apart
+from ..baselines.two_materials import best_levels, eroded, told_apart
+from ..checks import NoMatterError
 from ..inference import Decision, Score, select
 from ..matter import MaterialPrior, MatterKind
 from ..representations import VoxelGrid
@@ -119,7 +119,7 @@ class TrialFits:
         return trial.of(expected).score(self._trials.light_allowed(name, fold))
 
     def _fitted(self, trial: Trial, kind: MatterKind, two: bool) -> Tensor:
-        """What a fit predicts for the unseen frames."""
+        """What a fit predicts for the unseen frames; one that finds no matter, frames without any."""
         task, method = self._task, self._methods[kind]
         task.on_progress(f"fit of coarse frames: {method.kind}", 0.0)
         seen = replace(trial.seen, frames=trial.light.evened(torch.from_numpy(trial.seen.frames)).numpy())
@@ -129,7 +129,10 @@ class TrialFits:
             ratio = ratio_of_one(task, self._first).value if known else self._first.material.ratio
             prior = MaterialPrior.of_ratio(ratio, prior.sign)
         fitted = replace(task, scan=seen, prior=prior, lit=trial.light, matter=kind, first=None)
-        return predictions(solve_stages(method, fitted), trial.unseen)
+        try:
+            return predictions(solve_stages(method, fitted), trial.unseen)
+        except NoMatterError:
+            return torch.ones_like(trial.expected)
 
 
 def ratio_of_one(task: Task, first: FirstVolumes) -> Determined:
@@ -148,18 +151,14 @@ def flattened(values: Tensor, pixel: int) -> Iterator[Tensor]:
     Nothing is given where nothing lies inside.
     """
     v, rim = values.numpy(), 1 + pixel // 2
-    inside = _eroded(v > 0.5 * plateau(values), rim)
+    inside = eroded(v > 0.5 * plateau(values), rim)
     if not inside.any():
         return
     yield torch.from_numpy(np.where(inside, v[inside].mean(), v))
     found = best_levels(values, pixel)
     levels = (found.high, found.low)
-    lighter = _eroded(told_apart(values, levels, pixel)[1].numpy() > 0, rim)
-    denser = _eroded(v > 0.5 * sum(levels), rim)
+    lighter = eroded(told_apart(values, levels, pixel)[1].numpy() > 0, rim)
+    denser = eroded(v > 0.5 * sum(levels), rim)
     if lighter.any() and denser.any():
         flat = np.where(denser, v[denser].mean(), v)
         yield torch.from_numpy(np.where(lighter, v[lighter].mean(), flat))
-
-
-def _eroded(inside: np.ndarray, steps: int) -> np.ndarray:
-    return np.asarray(binary_erosion(inside, iterations=steps), dtype=bool)

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool3d, interpolate, max_pool3d, pad
 from torch.optim.adam import adam
 
-from ..checks import require
+from ..checks import NoMatterError, require
 from ..geometry import Grid, Views
 from ..matter import Matter
 from ..memory import memory_kept
@@ -57,7 +57,8 @@ def cloud_from_volume(
     while len(mass) > max_count:
         edge += 1
         mass, centre, size = _blocks(volume, edge, filled, max_count)
-    require(len(mass) > 0, "the start found no matter in the holograms; check material, energy and distance.")
+    if not len(mass):
+        raise NoMatterError
     position = centre * voxel + torch.tensor(grid.origin, dtype=torch.float32)
     sigma = 0.5 * size * voxel
     peak = mass * (size * voxel) ** 3 / ((2 * np.pi) ** 1.5 * sigma**3)
