@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
 import holosplat as hs
 from holosplat.beamline.simulate import simulate
 from holosplat.geometry import Grid, Views
+from holosplat.inference import Score
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import METHODS, PerView, Task
 from holosplat.methods.contrast import ABOVE, BELOW, STAGE, decide_sign
@@ -74,6 +76,18 @@ def test_what_is_told_is_not_asked(holes):
     told = Task(holes.train(), MaterialPrior.known(AIR_IN_WATER))
     first = first_of_task(told)
     assert decide_sign(first, lambda volumes, fold: pytest.fail("a score was asked for")) == (first, ())
+
+
+def test_a_volume_worse_than_none_does_not_tell_the_sign(cells):
+    """Holes that are hardly there leave less than it, and as much as no matter."""
+    first = first_of_task(Task(cells.train(), MaterialPrior.of_ratio(1500)))
+
+    def score(volumes, fold: int, without: str) -> Score:
+        unseen = first.folds.split(fold)[1]
+        left = torch.from_numpy(unseen.frames).double() - 1
+        return Score.of(left * (3.0 if volumes is first and not without else 1.0))
+
+    assert decide_sign(first, score)[1][0].choice == ABOVE
 
 
 @pytest.mark.parametrize("name", ["tikhonov-tv", "ctf-tv", "holographic-tv"])

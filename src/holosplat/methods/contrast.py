@@ -13,20 +13,22 @@ from ..checks import InputError
 from ..inference import Decision, Score, select
 from ..matter import MaterialPrior
 from .first_volumes import FirstVolumes
+from .trials import WITHOUT
 
 STAGE = "sign of the contrast"
 ABOVE, BELOW = "δ above the medium's", "δ below the medium's"
 
 
-Scoring = Callable[[FirstVolumes, int], Score]
-"""Of first volumes, on the unseen frames of a fold."""
+Scoring = Callable[[FirstVolumes, int, str], Score]
+"""Of first volumes, on the unseen frames of a fold; `WITHOUT` their matter, or with it ("")."""
 
 
 def decide_sign(first: FirstVolumes, *scores: Scoring) -> tuple[FirstVolumes, tuple[Decision, ...]]:
     """The first volumes of the sign that unseen frames speak for, and the decision; none where the sign is known.
 
     scores: in even light, and then in such light as may have hidden the sign: each is asked where those before it have
-    left the sign open. A sign under which no matter is found predicts even light.
+    left the sign open. A sign under which no matter is found predicts even light, and a sign is sure only where its
+    matter predicts frames better than none.
     """
     if first.prior.sign:
         return first, ()
@@ -34,21 +36,22 @@ def decide_sign(first: FirstVolumes, *scores: Scoring) -> tuple[FirstVolumes, tu
     holes = FirstVolumes(first.folds, first.prior.signed(-1), first.on_progress, first.options)
     volumes = {ABOVE: first, BELOW: holes}
 
-    def asked(score: Scoring) -> Decision:
+    def asked(score: Scoring, null: str, other: str) -> Decision:
         def scored(name: str, fold: int) -> Score:
+            sign, without, _ = name.partition(WITHOUT)
             try:
-                return score(volumes[name], fold)
+                return score(volumes[sign], fold, without)
             except InputError:  # there is no such matter, or no such light
                 unseen = first.folds.split(fold)[1]
                 return Score.of(unseen.left(torch.ones(unseen.frames.shape, dtype=torch.float64)))
 
-        return select(STAGE, (ABOVE, BELOW), scored, first.folds.count, by=first.folds.by)
+        beside = {other: (other + WITHOUT,)}
+        return select(STAGE, (null, other), scored, first.folds.count, by=first.folds.by, beside=beside)
 
-    decision = asked(scores[0])
-    for score in scores[1:]:
-        if decision.choice == BELOW or decision.compared[0].loses:
+    for score in scores:
+        decision = asked(score, ABOVE, BELOW)
+        if decision.choice == BELOW or asked(score, BELOW, ABOVE).choice == ABOVE:
             break
-        decision = asked(score)
     return volumes[decision.choice], (decision,)
 
 

@@ -43,6 +43,11 @@ T = TypeVar("T")
 BY_VIEWS, BY_FISSION = "views set aside", "data fission"
 
 
+def coarse_binning(scan: Scan) -> int:
+    """How many pixels along an edge are joined for first volumes."""
+    return scan.largest_binning(math.ceil(max(scan.views.shape) / WIDTH))
+
+
 @dataclass(frozen=True)
 class Folds:
     """Coarse frames, and how parts of them are kept from a fit.
@@ -56,13 +61,15 @@ class Folds:
     count: int
     by: str
     binning: int = 1
+    shape: tuple[int, int] | None = None
+    """(H, W) of the frames before binning; None: as these."""
 
     @classmethod
     def of(cls, train: Scan) -> Folds:
         """Of training frames of one time."""
-        binning, views = train.largest_binning(math.ceil(max(train.views.shape) / WIDTH)), len(train)
+        binning, views = coarse_binning(train), len(train)
         by, most = (BY_FISSION, 1) if views < FEWEST else (BY_VIEWS, MOST if views >= MANY else views)
-        return cls(train.binned(binning), most, by, binning)
+        return cls(train.binned(binning), most, by, binning, train.views.shape)
 
     def aside(self, fold: int) -> np.ndarray:
         """Numbers of the views that are not fitted. Folds share none; many views are not all predicted."""

@@ -61,9 +61,10 @@ def confirmed(task: Task, first: FirstVolumes, told: Hypothesis) -> Decision:
     """What first volumes have taken of light and noise beside what is told, against fits of smooth volumes.
 
     A first volume gains by a hypothesis that only steadies it: what it leaves of matter passes for correlated noise, or
-    for light. A fit through the waves, in units of the noise, leaves less.
+    for light. A fit through the waves, in units of the noise, leaves less. One fold is asked, and all of them where it
+    shows a gain that is not sure.
     """
-    fits = TrialFits(task, first, {"continuous": SmoothVolume().with_effort(EFFORT)})
+    fits = TrialFits(task, first, {"continuous": SmoothVolume(rounds=1).with_effort(EFFORT)})
     counts = range(len(told), len(first.taken))
     candidates = [name_of(first.taken[:count]) for count in (*counts, len(first.taken))]
     beside = {name_of(first.taken[: n + 1]): rivals(first.taken[:n], first.taken[n]) for n in counts}
@@ -72,6 +73,9 @@ def confirmed(task: Task, first: FirstVolumes, told: Hypothesis) -> Decision:
     def scored(name: str, fold: int) -> Score:
         return fits.score(name, "continuous", fold)
 
+    once = select(STAGE, candidates, scored, by=by, beside=beside)
+    if all(each.wins or not each.large for each in once.compared):
+        return once
     return select(STAGE, candidates, scored, first.folds.count, by=by, beside=beside)
 
 
@@ -124,11 +128,10 @@ def prepared(task: Task, method: Method | None = None, before: Prepared | None =
 def _scores(options: LightOptions) -> list[Scoring]:
     """The scores of volumes of frames as they were measured, and in smooth light where that may be."""
 
-    def under(hypothesis: Hypothesis, volumes: FirstVolumes, fold: int) -> Score:
+    def under(hypothesis: Hypothesis, volumes: FirstVolumes, fold: int, without: str) -> Score:
         trials = Trials(volumes, options)
         require(not hypothesis or trials.proposed(hypothesis, fold), "the light of the frames is even.")
-        tried = trials.tried(hypothesis, fold)
-        return tried.score(tried.light)
+        return trials.score(name_of(hypothesis) + without, fold)
 
     return [partial(under, one) for one in ((), (UNEVEN,)) if not one or options.kind != "even"]
 

@@ -23,7 +23,7 @@ from ..matter import MaterialPrior, MatterKind
 from ..representations import VoxelGrid
 from .first_volumes import BY_FISSION, FirstVolumes, predictions
 from .method import Method, Task, solve_stages
-from .trials import FREE, Trial, Trials, accepted, first_of_task, name_of, named
+from .trials import Trial, Trials, accepted, first_of_task, hypothesis_of, name_of
 from .uncertain import Determined, likeliest_ratio
 
 STAGE = "levels or continuous matter"
@@ -112,11 +112,11 @@ class TrialFits:
     def score(self, name: str, kind: MatterKind, fold: int, two: bool = False) -> Score:
         """Of the fit for a `kind` of matter (two: of two levels) to the fitted frames of a fold, under the hypothesis
         that has this `name`, or as a rival of one (`trials.rivals`)."""
-        hypothesis = named(name.partition(FREE)[0])
+        hypothesis = hypothesis_of(name)
         trial = self._trials.tried(hypothesis, fold)
         key = ("fit", hypothesis, self._methods[kind], two)
         expected = self._first.once(key, fold, lambda: self._fitted(trial, kind, two))
-        return trial.of(expected).score(self._trials.light_allowed(name, fold))
+        return self._trials.score_of(name, fold, expected)
 
     def _fitted(self, trial: Trial, kind: MatterKind, two: bool) -> Tensor:
         """What a fit predicts for the unseen frames; one that finds no matter, frames without any."""

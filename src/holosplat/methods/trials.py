@@ -12,17 +12,21 @@ from ..backends import Backend
 from ..checks import InputError
 from ..inference import MARGIN, Score
 from ..optics.background import FLUX, Background, Light, LightOptions
+from ..optics.finer_light import binned_options, finer_light
 from ..optics.noise_model import NoiseModel
 from ..optics.patterns import fixed_pattern
 from ..representations import VoxelGrid
 from ..scan import Scan
-from .first_volumes import FirstVolumes, Folds, lit_by_halves, predictions
+from .first_volumes import FirstVolumes, Folds, coarse_binning, lit_by_halves, predictions
 from .method import Task
 
 NULL = "as measured"
 UNEVEN = "uneven light"
 FREE = "; of unseen frames free: "
 """A rival of light of each frame's own: the volume before it, whose prediction is allowed the same light."""
+WITHOUT = "; without matter"
+"""A rival of every hypothesis: the same without its volume. Light that leaves nothing for matter to explain beats a
+volume that is worse than none, and says nothing of light."""
 
 Hypothesis = tuple[str, ...]
 """What is added to the null, in the order in which it was taken."""
@@ -38,10 +42,16 @@ def named(name: str) -> Hypothesis:
     return () if name == NULL else tuple(name.split(" and "))
 
 
+def hypothesis_of(name: str) -> Hypothesis:
+    """That of a name, or of one of its `rivals`."""
+    return named(name.partition(";")[0])
+
+
 def rivals(before: Hypothesis, one: str) -> tuple[str, ...]:
-    """What `one` must win against beside the hypothesis `before` it: where it is light of each frame's own, the volume
-    before it in such light."""
-    return (name_of(before) + FREE + one,) if one in (FLUX, UNEVEN) else ()
+    """What `one` must win against beside the hypothesis `before` it: the same without matter and, where it is light of
+    each frame's own, the volume before it in such light."""
+    without = name_of((*before, one)) + WITHOUT
+    return (without, name_of(before) + FREE + one) if one in (FLUX, UNEVEN) else (without,)
 
 
 @dataclass(frozen=True)
@@ -81,7 +91,11 @@ class Trials:
     """The hypotheses about some frames, each carried to a volume in every fold that is asked for."""
 
     def __init__(self, first: FirstVolumes, options: LightOptions) -> None:
-        self._first, self._options = first, options
+        folds = first.folds
+        self._first, self._options = (
+            first,
+            binned_options(options, folds.shape or folds.scan.views.shape, folds.binning),
+        )
 
     def tried(self, hypothesis: Hypothesis, fold: int) -> Trial:
         """The volume and the score of a hypothesis."""
@@ -101,14 +115,15 @@ class Trials:
 
     def score(self, name: str, fold: int) -> Score:
         """That of a hypothesis by its name, or of one of its `rivals`."""
-        return self.tried(named(name.partition(FREE)[0]), fold).score(self.light_allowed(name, fold))
+        return self.score_of(name, fold, self.tried(hypothesis_of(name), fold).expected)
 
-    def light_allowed(self, name: str, fold: int) -> Light:
-        """The light in which a hypothesis, or a rival of it, predicts unseen frames."""
-        plain, _, free = name.partition(FREE)
+    def score_of(self, name: str, fold: int, expected: Tensor) -> Score:
+        """The same where a volume predicts the unseen frames `expected` [V, H, W] in even light."""
+        plain, _, free = name.removesuffix(WITHOUT).partition(FREE)
         light = self._light((*named(plain), free) if free else named(plain), fold)
         assert light is not None  # it was proposed
-        return light
+        expected = torch.ones_like(expected) if name.endswith(WITHOUT) else expected
+        return self.tried(named(plain), fold).of(expected).score(light)
 
     def _light(self, hypothesis: Hypothesis, fold: int) -> Light | None:
         """What a hypothesis says of the fitted frames, by the volume without its last part; None where it cannot be."""
@@ -151,7 +166,8 @@ def plain_light(frames: Tensor, options: LightOptions) -> Light:
 
 def with_more(light: Light, hypothesis: str, seen: Scan, predicted: Tensor, options: LightOptions) -> Light | None:
     """`light` and what a hypothesis adds to it, by frames and their prediction [V, H, W] in even light; None where it
-    cannot be: a pattern of one frame, or light where none shows air."""
+    cannot be: a pattern of one frame, or light where none shows air. Smooth light is that of coarse pixels, on which it
+    is compared: on finer ones, what passes for air may be matter."""
     frames = torch.from_numpy(seen.frames)
     if hypothesis == "fixed pattern":
         return replace(light, still=fixed_pattern(light.evened(frames), predicted)) if len(seen) > 1 else None
@@ -160,10 +176,10 @@ def with_more(light: Light, hypothesis: str, seen: Scan, predicted: Tensor, opti
     if hypothesis == FLUX:
         known = light.background is not None  # then it holds the flux
         return None if known else replace(light, background=Background.of_flux(light.evened(frames), predicted))
+    frames, factor = frames if light.still is None else (frames / light.still).float(), coarse_binning(seen)
+    smooth = replace(binned_options(options, seen.views.shape, factor), kind="smooth")
     try:
-        found = Light.of(
-            frames if light.still is None else (frames / light.still).float(), replace(options, kind="smooth")
-        )
+        found = Light.of(torch.from_numpy(replace(seen, frames=frames.numpy()).binned(factor).frames), smooth)
     except InputError:  # no frame shows air
         return None
-    return replace(found, still=light.still)
+    return replace(finer_light(found, frames, factor), still=light.still)
