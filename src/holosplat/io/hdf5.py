@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 from h5py import h5d  # pyright: ignore[reportAttributeAccessIssue]  # compiled, without stubs
 
-from ..checks import InputError, MissingError, UnsaidError, require_regular, shaped
+from ..checks import InputError, MissingError, UnsaidError, is_of_memory, require_regular, shaped
 from ..units import unit_factor
 from .guard import require_memory
 from .hdf5_filters import filters_missing_in
@@ -34,6 +34,8 @@ def open_hdf5(path: str | Path) -> Iterator[h5py.File]:
             require_own(opened, file)
             yield opened
     except (OSError, RuntimeError, KeyError) as error:
+        if is_of_memory(error):
+            raise MemoryError(f"{path}: {error}") from error
         if missing := filters_missing_in(file):
             raise MissingError(
                 f"{path} is compressed by filters that HDF5 does not have here: {missing}; install them by pip install "
