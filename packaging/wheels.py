@@ -27,7 +27,6 @@ SMOKE = (
     "-m holosplat reconstruct scan.nxs --material water --method holographic-tv --out run",
     "-m holosplat export run --volume volume.h5",
     "-m holosplat bench run --list",
-    "-m holosplat doctor",
 )
 """What must work in an environment that has the wheel alone."""
 
