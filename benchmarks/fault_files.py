@@ -5,15 +5,17 @@ from __future__ import annotations
 import json
 import os
 import random
+import re
 import shutil
 import time
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 from fault_kills import sentence
-from fault_shop import BEAM, Shop, copied_run, is_whole
+from fault_shop import BEAM, WRITERS, Shop, copied_run, is_whole
 from forked import run
 
 from holosplat.checks import InputError
@@ -169,15 +171,33 @@ MEANT |= {(flag, "1e-300") for flag in ("psf-sigma-px", "misalign-shift", "uncer
 
 
 def odd(shop: Shop, rng: random.Random, folder: Path) -> str:
-    """A value that no experiment has: one sentence."""
-    name = rng.choice(list(FLAGS))
-    flag = f"--{rng.choice(FLAGS[name].split())}"
-    command = {"grow": ["grow", "--out", folder / "out"], "simulate": shop.simulate(folder / "out.nxs")}
-    command |= {"record": shop.record(folder / "out.nxs"), "reconstruct": shop.reconstruct(folder / "out")}
-    value = rng.choice(VALUES)
-    ended = run([*command[name], flag, value])
+    """A value that no experiment has: one sentence. By turns of an option in `FLAGS`, or of any number that any command
+    takes; of these, no value is tried that a longer job may have."""
+    if rng.random() < 0.5:
+        name = rng.choice(list(FLAGS))
+        flag, value = f"--{rng.choice(FLAGS[name].split())}", rng.choice(VALUES)
+        command = {"grow": ["grow", "--out", folder / "out"], "simulate": shop.simulate(folder / "out.nxs")}
+        command |= {"record": shop.record(folder / "out.nxs"), "reconstruct": shop.reconstruct(folder / "out")}
+        said = command[name]
+    else:
+        said = rng.choice([one for one in WRITERS if one.name not in SEVERAL]).command(shop, folder)
+        flag, value = rng.choice(_numbers(str(said[0]))), rng.choice(ABSURD)
+    ended = run([*said, flag, value])
     silent = ended.code == 0 and (flag.removeprefix("--"), value) not in MEANT
+    if sentence(ended) or silent:
+        print(*said, flag, repr(value), flush=True)
     return sentence(ended) or ("silent" if silent else "")
+
+
+SEVERAL = ("run", "bench", "series")
+"""Commands that have acts, or take no numbers."""
+ABSURD = ("nan", "inf", "-inf", "1e30", "-1e30", str(2**70), "9" * 400, "", "x", "\udc80")
+
+
+@cache
+def _numbers(name: str) -> list[str]:
+    """The options of a command that take one number, by its help."""
+    return sorted(set(re.findall(r"(--[a-z-]+) (?:FLOAT|INT)\s", run([name, "--help-all"]).said))) or ["--none"]
 
 
 def two(shop: Shop, rng: random.Random, folder: Path) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import re
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -88,4 +89,9 @@ def sentence(ended: Ended) -> str:
     """What is wrong with how a command ended: it must work, or say one sentence."""
     if ended.verdict or ended.code == 0:
         return ended.verdict
-    return "" if "holosplat: " in ended.said or "helptext" in ended.said else "traceback"
+    tidy = any(words in ended.said for words in ENDS) and not re.search(r"failed: \w*Error:", ended.said)
+    return "" if tidy else "traceback"
+
+
+ENDS = ("holosplat: ", "helptext", "holosplat series status|collect", "of these are wrong")
+"""What the last words of a command are when it did not do all that it was asked for."""

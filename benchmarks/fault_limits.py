@@ -15,7 +15,7 @@ from pathlib import Path
 
 import torch
 from fault_kills import sentence
-from fault_shop import Shop, Writer
+from fault_shop import LOOKERS, Shop, Writer
 from forked import Ended, attempted, run
 
 from holosplat.geometry import Grid, Poses, Views
@@ -28,8 +28,8 @@ VERSION = 0x20080522
 OVERRIDE = (1 << 1) | (1 << 2)
 """CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH: what lets root read and write everywhere."""
 EXTREME = (0.0, -0.0, float("nan"), float("inf"), -float("inf"), 3e38, -3e38, 1e30, -1e12, 1e-30, 1e-45, -1.0, 1e6)
-READERS = ("evaluate",)
-"""Commands that write nothing here: there is no truth, and the report is there already."""
+READERS = ("evaluate", *(one.name for one in LOOKERS))
+"""Commands that write nothing, or nothing here: without a truth, `evaluate` leaves the report as it is."""
 MARGIN = 1 << 30
 """Bytes of address space beside what a command has loaded: with as much, all commands work."""
 

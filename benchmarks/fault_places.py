@@ -86,7 +86,8 @@ def outputs(shop: Shop, rng: random.Random, folder: Path) -> str:
     if "run" in reads:
         reads.add("scan.nxs")
     allowed = {each for target in targets if forced for each in _of(target, folder)} - reads
-    lost = [name for name in changed if name not in allowed and not any(name.startswith(f"{one}/") for one in allowed)]
+    real = {name: os.path.relpath((folder / name).resolve(), folder.resolve()) for name in changed}
+    lost = [name for name in changed if not any(f"{real[name]}/".startswith(f"{one}/") for one in allowed)]
     if lost:
         print(" ".join(map(str, said)), "changed", lost, flush=True)
     return "lost" if lost else sentence(ended)
@@ -97,7 +98,8 @@ def _of(target: str, folder: Path) -> set[str]:
     place = (folder / target).resolve()
     real = str(place.relative_to(folder.resolve())) if folder.resolve() in place.parents else target
     pair = f"{real.removesuffix('.mrc')}.beta.mrc"
-    return {target, real, pair, *(f"{name}.provenance.json" for name in (real, pair) if name == "volume.mrc")}
+    ours = ("volume.mrc", "volume.beta.mrc")
+    return {target, real, pair, *(f"{name}.provenance.json" for name in (real, pair) if name in ours)}
 
 
 def _sums(folder: Path) -> dict[str, str]:
@@ -138,8 +140,12 @@ def foreign(shop: Shop, rng: random.Random, folder: Path) -> str:
         _say_so(copied / "provenance.json", lambda said: {"records": [said["records"][0] | {"command": command}]})
     if kind == "scan":
         commands["scan"][2] += ["--out", out, *MATERIAL]
-    ended = run(rng.choice(commands[kind]), first=lambda: os.chdir(folder))
-    return sentence(ended) or ("let in" if ended.code == 0 else "")
+    command = rng.choice(commands[kind])
+    ended = run(command, first=lambda: os.chdir(folder))
+    taken = ended.code == 0 and "problem  " not in ended.said
+    if taken:
+        print(" ".join(map(str, command)), flush=True)
+    return sentence(ended) or ("let in" if taken else "")
 
 
 def _say_so(path: Path, change: Callable[[dict], dict]) -> None:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import tifffile
 from forked import run
 from own_case import two_cells
 
@@ -18,8 +20,10 @@ from holosplat.io.formats import read
 from holosplat.io.pvd import read_pvd
 from holosplat.io.volume_formats import read_volume_file
 from holosplat.io.vtk import read_meshes, write_mesh
+from holosplat.learning.weights import read_weights
 from holosplat.mesh import TriangleMesh
 from holosplat.specimens.red_cells import random_cells
+from holosplat.training.folder import Dataset
 from holosplat.workflows.check import check
 
 PIXEL, ROWS, COLUMNS = 3.2e-6, 18, 20
@@ -77,6 +81,11 @@ class Shop:
         return self.path / "quick.json"
 
     @property
+    def scenes(self) -> Path:
+        """Scenes of `dataset`."""
+        return self.path / "scenes"
+
+    @property
     def case(self) -> Path:
         """A case of the benchmark."""
         return self.path / "own.toml"
@@ -97,6 +106,7 @@ class Shop:
             shop.reconstruct(shop.run),
             shop.in_motion(cells),
             ["track", shop.moving, "--out", shop.track, *TRACK],
+            ["dataset", "--out", shop.scenes, *SCENES],
         ):
             ended = run(command, limit=600)
             if ended.code != 0:
@@ -106,6 +116,10 @@ class Shop:
     def simulate(self, out: Path) -> list[object]:
         """Six frames."""
         return ["simulate", *self.cells, *BEAM, "--views", 6, "--out", out]
+
+    def short(self, *command: object) -> list[object]:
+        """A command that reconstructs, with the options of a short run."""
+        return [*command, *MATERIAL, "--matter", "levels", "--config", self.quick]
 
     def in_motion(self, cells: list[TriangleMesh]) -> list[object]:
         """Four frames at each of three times; the cells go half a pixel from one to the next."""
@@ -124,7 +138,7 @@ class Shop:
 
     def reconstruct(self, out: Path) -> list[object]:
         """A short run."""
-        return ["reconstruct", self.scan, "--out", out, *MATERIAL, "--matter", "levels", "--config", self.quick]
+        return self.short("reconstruct", self.scan, "--out", out)
 
 
 @dataclass(frozen=True)
@@ -174,11 +188,27 @@ def copied_run(shop: Shop, folder: Path) -> Path:
 GROWTH = ["--cells", 1, "--box", "30e-6", "20e-6", "20e-6", "--snapshots", 4, "--frequency", 3, "--interval", "1e-6"]
 TRACK = [*MATERIAL, "--effort", 0.05, "--pieces", 1, "--rounds", 0, "--no-intervals"]
 SURFACE = ["--steps", 8]
+SCENES = ["--count", 3, "--rows", 64, "--columns", 64, "--views", 3, "--held-out", 1]
+NETWORK = ["--steps", 4, "--volume", 4, 8, 8, "--keep-every", 2, "--validation", 1]
 
 
 def _piped(shop: Shop, folder: Path) -> list[object]:
     (folder / "pipeline.toml").write_text(pipeline(shop, folder / "out"))
     return ["run", folder / "pipeline.toml"]
+
+
+def _planned(shop: Shop, folder: Path) -> list[object]:
+    ended = run(shop.short("series", "plan", shop.moving, "--window", 2, "--out", folder / "out"))
+    if ended.code != 0:
+        raise SystemExit(f"series plan must work before series run is disturbed, but: {ended.said}")
+    return ["series", "run", folder / "out"]
+
+
+def _watched(shop: Shop, folder: Path) -> list[object]:
+    (folder / "come").mkdir(exist_ok=True)
+    shutil.copy(shop.scan, folder / "come")
+    times = ["--poll", 0.1, "--settle", 0.1, "--idle", 1]
+    return shop.short("watch", folder / "come", "--out", folder / "out", *times)
 
 
 def _exported(name: str, *options: object, moving: bool = False) -> Writer:
@@ -233,6 +263,36 @@ WRITERS = (
         lambda shop, folder: ["surface", shop.run, "--scan", shop.scan, "--out", folder / "out", *SURFACE],
         "out",
     ),
+    Writer("retrieve", lambda shop, folder: ["retrieve", shop.scan, *MATERIAL, "--out", folder / "out"], "out"),
+    Writer(
+        "calibrate",
+        lambda shop, folder: [
+            *("calibrate", shop.scan, "--phantom", shop.cells[0], *MATERIAL, "--out", folder / "out.toml")
+        ],
+        "out.toml",
+    ),
+    Writer(
+        "plan",
+        lambda shop, folder: [
+            *("plan", "--mesh", shop.cells[0], "--energy-range", 10, 20, *MATERIAL, "--out", folder / "out.png")
+        ],
+        "out.png",
+    ),
+    Writer(
+        "forecast",
+        lambda shop, folder: ["forecast", shop.track, "--out", folder / "out", "--times", 1, "--no-half-sets"],
+        "out",
+    ),
+    Writer("dataset", lambda shop, folder: ["dataset", "--out", folder / "out", *SCENES], "out", goes_on=True),
+    Writer(
+        "train",
+        lambda shop, folder: ["train", shop.scenes, "--out", folder / "out", *NETWORK],
+        "out",
+        ("--resume",),
+        ("train.json", "checkpoint.pt"),
+    ),
+    Writer("series", _planned, "out", goes_on=True),
+    Writer("watch", _watched, "out", goes_on=True),
     Writer(
         "bench",
         lambda shop, folder: (["bench", "run", "--cases", shop.case, "--methods", *METHODS, "--out", folder / "out"]),
@@ -241,6 +301,16 @@ WRITERS = (
         goes_on=True,
     ),
 )
+
+
+LOOKERS = tuple(
+    Writer(" ".join(map(str, words)), lambda shop, folder, words=words: list(words), "none")
+    for words in (("doctor",), ("backends",), ("init",), ("materials",), ("data", "list"))
+) + (
+    Writer("check", lambda shop, folder: ["check", shop.run], "none"),
+    Writer("info RUN", lambda shop, folder: ["info", shop.run], "none"),
+)
+"""Commands that write nothing."""
 
 
 def is_whole(out: Path) -> bool:
@@ -253,7 +323,7 @@ def is_whole(out: Path) -> bool:
         return False
 
 
-SOUND = (".vti", ".nrrd", ".mrc", ".tif", ".vtu", ".pvd", ".xdmf", ".html", ".png")
+SOUND = (".toml", ".vti", ".nrrd", ".mrc", ".tif", ".vtu", ".pvd", ".xdmf", ".html", ".png")
 """Suffixes of files of other programs, which `check` does not know."""
 
 
@@ -261,6 +331,8 @@ def _is_sound(out: Path) -> bool:
     """Whether a file of another program is complete, and so are those that it names."""
     if out.suffix in (".html", ".png"):
         return out.suffix == ".png" or out.read_bytes().rstrip().endswith(b"</html>")  # pictures stay blank
+    if out.suffix == ".toml":
+        return "view" in tomllib.loads(out.read_text(encoding="utf-8"))
     if out.suffix == ".xdmf":
         return all(not check(out.parent / name)[1] for name in XDMF.findall(out.read_text(encoding="utf-8")))
     if out.suffix in (".vtu", ".pvd"):
@@ -270,10 +342,20 @@ def _is_sound(out: Path) -> bool:
 
 
 def reads(out: Path) -> bool:
-    """Whether a folder of images, of meshes, or of a benchmark, is whole."""
+    """Whether a folder of images, of meshes, of scenes, of weights, or of several runs, is whole."""
     if (out / "bench.json").is_file():
         return run(["bench", "report", out]).code == 0 and len(list((out / "rows").glob("*.json"))) >= len(METHODS)
+    if (out / "series.json").is_file():
+        return run(["series", "collect", out]).code == 0
     try:
+        if (out / "maps.json").is_file():
+            return all(len(tifffile.imread(out / f"{name}.tif")) == 6 for name in ("phase", "thickness"))
+        if (out / "dataset.json").is_file():
+            return not Dataset.read(out).missing()
+        if (out / "train.json").is_file():
+            return bool(read_weights(out / "weights.safetensors"))
+        if (out / "watch.json").is_file():
+            return all(not check(file.parent)[1] for file in (out / "scans").rglob("config.json"))
         if list(out.glob("*.vt[kp]")):
             read_meshes([out], "um")
         else:

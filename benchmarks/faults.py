@@ -29,7 +29,7 @@ from fault_formats import formats, records
 from fault_kills import full, killed
 from fault_limits import denied, extreme, starved
 from fault_places import foreign, outputs
-from fault_shop import WRITERS, Shop, Writer
+from fault_shop import LOOKERS, WRITERS, Shop, Writer
 from forked import loaded, run, size_of
 from rows import read, write
 
@@ -71,7 +71,8 @@ def trials(
     for number in range(count):
         if time.perf_counter() - begun > seconds:
             break
-        writer = writers[number % len(writers)]
+        several = (*writers, *LOOKERS) if kind in LIMITED and writers is WRITERS else writers
+        writer = several[number % len(several)]
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
             if kind in SINGLE:

@@ -18,8 +18,10 @@ from typing import Any
 
 import numpy as np
 
-OUT_OF_MEMORY = re.compile("can't allocate memory|not enough memory|out of memory|std::bad_alloc", re.IGNORECASE)
-"""What torch says of memory, in errors of no kind of their own."""
+OUT_OF_MEMORY = re.compile(
+    "can(no|')t allocate memory|memory allocation failed|not enough memory|out of memory|std::bad_alloc", re.IGNORECASE
+)
+"""What libraries say of memory, in errors of other kinds."""
 LONGEST = 200
 """Characters of another message within ours, at most."""
 
@@ -58,6 +60,11 @@ class NoMatterError(InputError):
 
     def __init__(self) -> None:
         super().__init__("the start found no matter in the holograms; check material, energy and distance.")
+
+
+def is_of_memory(error: BaseException) -> bool:
+    """Whether an error, of whichever kind, says that memory ran out."""
+    return isinstance(error, MemoryError) or bool(OUT_OF_MEMORY.search(str(error)))
 
 
 def note(text: str) -> None:
@@ -156,7 +163,7 @@ def as_written(path: str | Path, what: str = "") -> Iterator[None]:
             raise
         raise InputError(f"{path} must be {what or 'as it was written'}, but it is not: {error}") from error
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, AssertionError, RuntimeError) as error:
-        if OUT_OF_MEMORY.search(str(error)):
+        if is_of_memory(error):
             raise
         said = " ".join(str(error).split())[:LONGEST] or type(error).__name__
         raise InputError(

@@ -30,6 +30,8 @@ class Within:
 
     def fault(self, value: float) -> str:
         """What `value` must be instead of what it is; empty where it is one of them."""
+        if isinstance(value, bool):
+            return "must be a number"
         if not (isinstance(value, Integral) or math.isfinite(value)):  # what is whole may be too large for a float
             return "must be a finite number"
         if value > self.high:
@@ -173,7 +175,7 @@ def require_plausible(values: Any, name: str = "", *, others: bool = True) -> No
     elif isinstance(values, list | tuple):
         for value in values:
             require_plausible(value, name, others=others)
-    elif isinstance(values, Real) and not isinstance(values, bool) and (others or name in COUNTED):
+    elif isinstance(values, Real) and (name in COUNTED or (others and not isinstance(values, bool))):
         fault = (RISING if name in COUNTED else ANY).fault(values)  # pyright: ignore[reportArgumentType]
         require(not fault, f"{name} {fault}, but it is {_shown(values)}; it is not what was written.")  # pyright: ignore[reportArgumentType]
 

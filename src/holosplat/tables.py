@@ -28,7 +28,7 @@ LARGEST = 1 << 64
 DOTTED = re.compile(r"""(?:[\w"'-]+[ \t]*\.[ \t]*){64}""")
 """A key of TOML with more parts than any table is deep; of tens of thousands, the decoder takes gigabytes."""
 MOST_ENTRIES = 2_000_000
-"""Tables, keys and values of a TOML file, at most: the decoder takes some microseconds for each."""
+"""Tables, keys and values of a file, at most: decoders take some microseconds for each."""
 SHOWN = 60
 """Characters of a value in messages, at most."""
 
@@ -65,6 +65,7 @@ def table_in(text: str) -> dict[str, Any]:
 
 
 def _json(text: str) -> Any:
+    _require_few(text, "[{,")
     found = json.loads(text, parse_constant=_no_number)
     _require_numbers(found)
     return found
@@ -73,11 +74,16 @@ def _json(text: str) -> Any:
 def _toml(text: str) -> dict[str, Any]:
     if DOTTED.search(text):
         raise RecursionError
-    if (entries := sum(map(text.count, "[{=,"))) > MOST_ENTRIES:
-        raise ValueError(f"it has some {entries} entries, and at most {MOST_ENTRIES} are read")
+    _require_few(text, "[{=,")
     found = tomllib.loads(text)
     _require_numbers(found)
     return found
+
+
+def _require_few(text: str, signs: str) -> None:
+    """`ValueError` for a text of more entries than take seconds, each of which has one of `signs` at least."""
+    if (entries := sum(map(text.count, signs))) > MOST_ENTRIES:
+        raise ValueError(f"it has some {entries} entries, and at most {MOST_ENTRIES} are read")
 
 
 def read_rows(path: Path, what: str) -> list[dict[str, str]]:

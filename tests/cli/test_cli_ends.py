@@ -63,6 +63,7 @@ def test_what_is_ignored_stays_ignored():
         (OSError(36, "File name too long"), "File name too long); check its path, its permissions and the disk."),
         (MemoryError(), "the memory of this machine is not enough; take larger pixels"),
         (RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: 8 bytes"), "is not enough ([enforce"),
+        (OSError(12, "Cannot allocate memory"), "the memory of this machine is not enough ([Errno 12]"),
         (RecursionError(), "the input is nested too deeply; make it flat."),
         (UnicodeEncodeError("utf-8", "\udcff", 0, 1, "surrogates not allowed"), "a name or text is none in UTF-8"),
     ],

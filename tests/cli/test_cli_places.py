@@ -130,6 +130,33 @@ def test_what_loses_nothing_is_not_refused_for_its_place(place):
     assert INSIDE not in holosplat("reconstruct", "a", "--out", "run", "--resume", "--config", "run/config.json").err
 
 
+@pytest.mark.parametrize("where", [".lock", "times/t0000/.lock"])
+def test_a_folder_that_another_process_writes_is_not_replaced(place, where):
+    lock = place / "other" / where
+    lock.parent.mkdir(parents=True)
+    lock.write_text(json.dumps({"host": "elsewhere", "process": 1}))
+    for name in ("config.json", "object.h5"):
+        (place / "other" / name).write_text("{}")
+    before = files(place)
+    for arguments in (
+        ["reconstruct", "a", "--out", "other"],
+        ["dataset", "--out", "other"],
+        ["grow", "--out", "other"],
+    ):
+        assert "must have one writer, but process 1 on elsewhere" in holosplat(*arguments, "--force").err
+    assert files(place) == before
+
+
+@pytest.mark.parametrize("out", [".", "/"])
+def test_an_output_has_a_name(place, out):
+    for arguments in (
+        ["convert", "a", out, "--to", "tiff"],
+        ["reconstruct", "a", "--out", out],
+        ["demo", "--out", out],
+    ):
+        assert "is a folder without a name" in holosplat(*arguments, "--force").err
+
+
 def leaves(function: Any) -> Iterator[tuple[str, Any]]:
     """Names and types of all arguments, those of dataclasses in their place."""
     for name, hint in hints_of(function).items():

@@ -34,7 +34,7 @@ from holosplat.matter import MaterialPrior
 from holosplat.methods import Gaussians
 from holosplat.ranges import COUNT, with_checked_numbers
 from holosplat.series.folder import PLAN, SeriesFolder
-from holosplat.series.plan import MOST_TASKS, SeriesPlan, Source
+from holosplat.series.plan import MOST_TIMES, SeriesPlan, Source
 from holosplat.series.settings import Cut, Settings
 from holosplat.tables import overridden, read_table
 from holosplat.volume import Volume
@@ -95,6 +95,13 @@ def test_tables_without_end_are_refused_before_they_are_parsed(tmp_path, monkeyp
         read_table(tmp_path / "a.toml")
 
 
+def test_json_without_end_is_refused_before_it_is_parsed(tmp_path, monkeypatch):
+    monkeypatch.setattr("json.loads", lambda *_, **__: pytest.fail("it was parsed"))
+    (tmp_path / "a.json").write_text("[" + "1," * 2_000_001)
+    with pytest.raises(InputError, match="entries, and at most 2000000 are read"):
+        read_table(tmp_path / "a.json")
+
+
 @pytest.mark.parametrize(
     "text", [".".join(["a"] * 50_000) + " = 1", f"[{' . '.join(['a'] * 50_000)}]", "a = " + "[" * 50_000]
 )
@@ -104,11 +111,11 @@ def test_tables_that_are_nested_too_deeply_are_refused(tmp_path, text):
         read_table(tmp_path / "a.toml")
 
 
-def test_a_series_has_as_many_tasks_as_can_be_looked_at(tmp_path):
-    source = Source(tmp_path, (0.0,) * (MOST_TASKS + 1), "", MaterialPrior.unknown())
-    plan = SeriesPlan((source,), Settings("reconstruct", Gaussians()), Reading(), Cut(window=1))
+def test_a_series_has_as_many_times_as_can_be_looked_at(tmp_path):
+    source = Source(tmp_path, (0.0,) * (MOST_TIMES + 1), "", MaterialPrior.unknown())
+    plan = SeriesPlan((source,), Settings("reconstruct", Gaussians()), Reading(), Cut(window=16))
     (tmp_path / PLAN).write_text(json.dumps(plan.as_table()))
-    with pytest.raises(InputError, match=f"at most {MOST_TASKS} tasks, but these are {MOST_TASKS + 1}"):
+    with pytest.raises(InputError, match=f"at most {MOST_TIMES} times, but these are {MOST_TIMES + 1}"):
         SeriesFolder(tmp_path).plan()
 
 

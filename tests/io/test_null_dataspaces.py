@@ -80,6 +80,22 @@ def test_datasets_of_a_scan(scan, name):
         read_scan(nulled(scan, name))
 
 
+@pytest.mark.parametrize("way", ["plain", "virtual"])
+@pytest.mark.parametrize("name", ["entry/instrument/detector/distance", "entry/sample/view_rotation"])
+def test_datasets_that_were_never_written(scan, tmp_path, name, way):
+    """HDF5 gives zeros for them: a scan in contact, say."""
+    path = Path(shutil.copy(scan, tmp_path / "scan.nxs"))
+    with h5py.File(path, "r+") as file:
+        shape = file[name].shape
+        del file[name]
+        if way == "plain":
+            file.create_dataset(name, shape, "f8")
+        else:
+            file.create_virtual_dataset(name, h5py.VirtualLayout(shape, "f8"))
+    with pytest.raises(InputError, match=f"/{name} must be written, but it has no data"):
+        read_scan(path)
+
+
 def test_what_is_not_read_may_hold_nothing(scan):
     assert len(read_scan(nulled(scan, "entry/definition"))) == 4
 

@@ -13,6 +13,7 @@ import pytest
 from helpers.odd_files import SHAPE, N, a_scan
 from holosplat.checks import InputError, MissingError
 from holosplat.io.formats import read_as
+from holosplat.io.hdf5 import open_hdf5
 from holosplat.io.hdf5_filters import filters_missing_in
 from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.io.reading import Reading, Told
@@ -123,3 +124,11 @@ def test_filters_that_are_plugins_are_named(tmp_path, monkeypatch):
     monkeypatch.setattr(h5py.Dataset, "__getitem__", lambda *_: (_ for _ in ()).throw(OSError("no filter")))
     with pytest.raises(MissingError, match=r"filters that HDF5 does not have here: fletcher32 .*holosplat\[codecs\]"):
         _ = read_scan(path).frames
+
+
+def test_a_lack_of_memory_is_not_called_damage(tmp_path):
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        file["a"] = np.ones(3)
+    with pytest.raises(MemoryError, match="memory allocation failed"), open_hdf5(path):
+        raise OSError("Can't synchronously read data (memory allocation failed for chunk)")

@@ -24,7 +24,7 @@ from holosplat.series import time as series_time
 from holosplat.series.folder import SeriesFolder
 from holosplat.series.run import run_left, states
 from holosplat.series.settings import Settings
-from holosplat.series.task import run_task
+from holosplat.series.task import attempted, run_task
 from holosplat.workflows.run_folder import RunFolder
 
 
@@ -34,6 +34,14 @@ def arrays(folder: SeriesFolder, task: int, moment: int) -> dict[str, torch.Tens
 
 def same(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> bool:
     return one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("[enforce fail] can't allocate memory: 8 bytes")])
+def test_a_time_that_finds_no_memory_says_so(error):
+    def fail() -> str:
+        raise error
+
+    assert attempted(fail).startswith("the memory of this machine is not enough; take larger pixels")
 
 
 def test_times_have_runs_and_rows(done, files):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import resource
 from dataclasses import replace
 from pathlib import Path
 
@@ -83,6 +84,20 @@ def test_what_is_resumed_ends_as_what_was_never_interrupted(data, tmp_path):
     assert whole_run.rows == parts.rows
     with (tmp_path / "parts" / "curves.csv").open(encoding="utf-8") as file:
         assert [row["step"] for row in csv.DictReader(file)] == ["1", "2", "3", "4", "5", "6"]
+
+
+@pytest.mark.parametrize("size", [0, 3000, 30_000])
+def test_a_checkpoint_that_does_not_fit_is_one_sentence(data, tmp_path, size):
+    """torch says of a full disk what is no error of files."""
+    training = Training.begun(data, tmp_path / "run", OPTIONS)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        with pytest.raises(InputError, match=r"checkpoint\.pt must be writable, but writing it failed"):
+            training.keep(Validation([]))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert [path.name for path in (tmp_path / "run").iterdir()] == ["train.json"]
 
 
 @pytest.fixture

@@ -30,6 +30,16 @@ def test_a_good_installation_passes():
     assert done.out.endswith("all is well\n")
 
 
+@pytest.mark.parametrize(
+    ("version", "here", "said"), [("13.0", False, True), ("13.0", True, False), (None, False, False)]
+)
+def test_the_cpu_build_of_torch_is_named_where_there_is_no_gpu(monkeypatch, version, here, said):
+    monkeypatch.setattr(doctor.torch.version, "cuda", version)
+    monkeypatch.setattr(doctor.torch.cuda, "is_available", lambda: here)
+    found = next(check.found for check in doctor.checks() if check.name == "torch")
+    assert ("CPU build does as much in less room" in found) == said
+
+
 @pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize(
     ("name", "value", "remedy"),

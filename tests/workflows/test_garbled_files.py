@@ -18,6 +18,7 @@ from holosplat.report.info import facts_of_run
 from holosplat.series.folder import Row, read_row, write_row
 from holosplat.specimens.red_cells import icosphere
 from holosplat.workflows.preconditions import require_alike
+from holosplat.workflows.reconstruct import load_reconstruction
 from holosplat.workflows.run_folder import RunFolder
 
 OLD_RUN = Path(__file__).resolve().parents[1] / "data/run_0_1_0"
@@ -122,3 +123,12 @@ def test_a_run_with_a_garbled_entry_is_told_of(tmp_path, name, change):
     (run / name).write_text(json.dumps(table | change))
     with pytest.raises(InputError, match=r"must be .*as it was written"):
         facts_of_run(RunFolder(run))
+
+
+def test_true_is_no_number_of_a_run(tmp_path):
+    """Python takes it for 1."""
+    run = Path(shutil.copytree(OLD_RUN, tmp_path / "run"))
+    summary = json.loads((run / "summary.json").read_text())
+    (run / "summary.json").write_text(json.dumps(summary | {"oversample": True}))
+    with pytest.raises(InputError, match="oversample must be a number, but it is True"):
+        load_reconstruction(RunFolder(run))

@@ -16,7 +16,7 @@ from io import TextIOWrapper
 
 import tyro
 
-from ..checks import OUT_OF_MEMORY, InputError
+from ..checks import InputError, is_of_memory
 from ..plugins import Extended
 from ..ranges import checked_later
 from ..version import __version__
@@ -187,8 +187,6 @@ def _carry_out(log: ExitStack) -> None:
             )
     except InputError as error:
         give_up(str(error))
-    except MemoryError as error:
-        give_up(f"the memory of this machine is not enough{_said(error)}; take larger pixels (--bin) or fewer rows.")
     except RecursionError:
         give_up("the input is nested too deeply; make it flat.")
     except UnicodeError as error:
@@ -199,12 +197,14 @@ def _carry_out(log: ExitStack) -> None:
     except BrokenPipeError:  # the reader, such as `head`, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(1) from None
-    except OSError as error:
-        give_up(f"a file cannot be read or written{_said(error)}; check its path, its permissions and the disk.")
-    except RuntimeError as error:
-        if not OUT_OF_MEMORY.search(str(error)):
+    except (MemoryError, OSError, RuntimeError) as error:
+        if is_of_memory(error):
+            give_up(
+                f"the memory of this machine is not enough{_said(error)}; take larger pixels (--bin) or fewer rows."
+            )
+        if not isinstance(error, OSError):
             raise
-        give_up(f"the memory of this machine is not enough{_said(error)}; take larger pixels (--bin) or fewer rows.")
+        give_up(f"a file cannot be read or written{_said(error)}; check its path, its permissions and the disk.")
 
 
 def _explained(arguments: list[str]) -> bool:

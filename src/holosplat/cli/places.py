@@ -24,6 +24,7 @@ from ..checks import InputError, require
 from ..io.folder import is_taken, require_new, require_parent
 from ..io.json import read_json
 from ..io.leftovers import LOCK
+from ..io.lock import require_unwritten
 from ..io.provenance import NAME, Command, beside, carried_out, records
 from ..ranges import flag, hints_of, with_checked_numbers
 from ..workflows.manifest import MANIFEST
@@ -130,6 +131,11 @@ def places_of(function: Callable[..., Any], values: Mapping[str, Any]) -> list[P
 def require_apart(places: Sequence[Place]) -> None:
     """`InputError` that names the first output which is an input, another output, or within a run or an input; with
     each path goes what belongs to it (`Place.companions`)."""
+    for place in places:
+        require(
+            not place.written or bool(place.path.name),
+            f"{place.flag} must name what is made, but {place.path} is a folder without a name; name a new one in it.",
+        )
     every = [one for place in places for one in (place, *place.companions())]
     read = [one for one in every if not one.written and one.is_there()]
     outputs = [one for one in every if one.written]
@@ -176,6 +182,8 @@ def _require_replaceable(folder: Path, option: str, places: Sequence[Place]) -> 
         f"--force replaces folders that holosplat made, but {folder} has no {NAME} of it; remove it yourself, or "
         f"choose another {option}.",
     )
+    for lock in folder.rglob(LOCK):
+        require_unwritten(lock.parent)
     for source in places:
         require(
             source.written or not source.is_there() or not _is_in(source.path, folder),

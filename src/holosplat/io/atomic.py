@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import csv
+import io
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from ..checks import InputError, require
 from .durable import flushed
@@ -57,6 +59,18 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):  # what went wrong before is said, not this
             temporary.unlink(missing_ok=True)
+
+
+def write_state(path: Path, state: Mapping[str, Any], earlier: Path | None = None) -> None:
+    """Write what a fit goes on with, whole or not at all; what was there before becomes `earlier`."""
+    import torch
+
+    content = io.BytesIO()  # torch says of a full disk what is no error of files
+    torch.save(dict(state), content)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content.getbuffer())
+        if earlier is not None and path.is_file():
+            os.replace(path, earlier)
 
 
 def write_rows(path: str | Path, head: Sequence[str], rows: Iterable[Iterable[object]]) -> None:

@@ -11,8 +11,9 @@ from typing import Any
 
 import h5py
 import numpy as np
+from h5py import h5d  # pyright: ignore[reportAttributeAccessIssue]  # compiled, without stubs
 
-from ..checks import InputError, MissingError, UnsaidError, require_regular, shaped
+from ..checks import InputError, MissingError, UnsaidError, is_of_memory, require_regular, shaped
 from ..units import unit_factor
 from .guard import require_memory
 from .hdf5_filters import filters_missing_in
@@ -33,6 +34,8 @@ def open_hdf5(path: str | Path) -> Iterator[h5py.File]:
             require_own(opened, file)
             yield opened
     except (OSError, RuntimeError, KeyError) as error:
+        if is_of_memory(error):
+            raise MemoryError(f"{path}: {error}") from error
         if missing := filters_missing_in(file):
             raise MissingError(
                 f"{path} is compressed by filters that HDF5 does not have here: {missing}; install them by pip install "
@@ -94,8 +97,10 @@ class Fields:
         return found
 
     def numbers(self, name: str) -> np.ndarray:
-        """All of the dataset `name` as float64."""
+        """All of the dataset `name` as float64; `InputError` where none of it was ever written."""
         found = self.dataset(name)
+        if found.size and _is_unwritten(found):  # HDF5 would give zeros
+            raise InputError(f"{self.label(name)} must be written, but it has no data; write it, or take it out.")
         require_memory(self.label(name), 8 * int(np.prod(found.shape, dtype=object)))
         return np.asarray(found[()], dtype=np.float64)
 
@@ -104,6 +109,13 @@ class Fields:
         said = self.dataset(name).attrs
         text = attribute_text(said.get("units", said.get("unit")))
         return unit_factor(self.label(name), default if text is None else text, table)
+
+
+def _is_unwritten(dataset: h5py.Dataset) -> bool:
+    """Whether a dataset holds nothing but the value that HDF5 gives where nobody said one."""
+    plan = dataset.id.get_create_plist()
+    held = plan.get_virtual_count() if dataset.is_virtual else dataset.id.get_storage_size()
+    return held == 0 and plan.fill_value_defined() != h5d.FILL_VALUE_USER_DEFINED
 
 
 def attribute_text(value: Any) -> str | None:

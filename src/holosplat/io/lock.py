@@ -98,6 +98,17 @@ def writer_of(folder: Path) -> Writer | None:
     return Writer(str(holder.get("host", "?")), process, str(holder.get("since", "?")), _is_stale(lock, holder))
 
 
+def require_unwritten(folder: Path) -> None:
+    """`TakenError` where another process writes to `folder`, or may do so."""
+    writer = writer_of(folder)
+    if writer is not None and not writer.gone:
+        raise TakenError(
+            f"{folder} must have one writer, but process {writer.process or '?'} on {writer.host} writes to it since "
+            f"{writer.since}; wait for its end, or remove {Path(os.path.realpath(folder)) / LOCK} if there is no such "
+            "process any more."
+        )
+
+
 def _take(lock: Path, folder: Path) -> int | None:
     """Put a lock of this process there, and give the open file that the kernel has locked, None where it cannot;
     `InputError` where there is a lock of another process."""
@@ -107,13 +118,7 @@ def _take(lock: Path, folder: Path) -> int | None:
         seen = _text(lock)
         if seen is None:  # it has just gone
             continue
-        holder = _holder(seen)
-        if not _is_stale(lock, holder):
-            where = f"process {holder.get('process', '?')} on {holder.get('host', 'an unknown machine')}"
-            raise TakenError(
-                f"{folder} must have one writer, but {where} writes to it since {holder.get('since', '?')}; wait for "
-                f"its end, or remove {lock} if there is no such process any more."
-            )
+        require_unwritten(folder)
         _remove(lock, seen)
     raise TakenError(f"{folder} must have one writer, but several try to be it; try again.")
 

@@ -18,8 +18,8 @@ from ..scan import Scan
 from .settings import Cut, Settings, prior_of
 
 FORMAT = "holosplat series 1"
-MOST_TASKS = 100_000
-"""Tasks of a series, at most: each is a folder."""
+MOST_TIMES = 100_000
+"""Times of a series, at most: each is a folder."""
 
 
 @dataclass(frozen=True)
@@ -86,12 +86,10 @@ class SeriesPlan:
         return found
 
     def require_few(self) -> None:
-        """`InputError` for too many tasks."""
-        count = sum(len(source.times) for source in self.sources) // self.cut.window  # at least
-        count = count if count > MOST_TASKS else len(self.windows())
+        """`InputError` for too many times."""
+        count = sum(len(source.times) for source in self.sources)
         require(
-            count <= MOST_TASKS,
-            f"a series has at most {MOST_TASKS} tasks, but these are {count}; choose a larger window.",
+            count <= MOST_TIMES, f"a series has at most {MOST_TIMES} times, but these are {count}; plan parts of it."
         )
 
     def as_table(self) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ..bodies.moments import moments
-from ..checks import InputError, require
+from ..checks import InputError, is_of_memory, require
 from ..io.formats import read_frames
 from ..io.json import write_json
 from ..io.lock import sole_writer
@@ -130,6 +130,8 @@ def attempted(work: Callable[[], str]) -> str:
     except InputError as error:
         return str(error)
     except Exception as error:
+        if is_of_memory(error):
+            return "the memory of this machine is not enough; take larger pixels (--bin), fewer rows or fewer jobs"
         lines = str(error).strip().splitlines()
         return ": ".join([type(error).__name__, *lines[-1:]])
 

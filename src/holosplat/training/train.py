@@ -17,7 +17,7 @@ from torch.nn.utils import clip_grad_norm_
 
 from ..backends import missing
 from ..checks import InputError, as_written, require
-from ..io.atomic import atomic_path, write_rows
+from ..io.atomic import write_rows, write_state
 from ..io.json import read_json, write_json
 from ..learning.network import Guess
 from ..learning.weights import Card, write_weights
@@ -155,8 +155,7 @@ class Training:
     def keep(self, validation: Validation) -> None:
         """Write the checkpoint, the curves and the validation, each whole or not at all."""
         state: dict[str, Any] = {name: part.state_dict() for name, part in self.parts().items()}
-        with atomic_path(self.folder / CHECKPOINT) as temporary:
-            torch.save(state | {"step": self.step, "rows": [list(row) for row in self.rows]}, temporary)
+        write_state(self.folder / CHECKPOINT, state | {"step": self.step, "rows": [list(row) for row in self.rows]})
         write_rows(self.folder / CURVES, self.columns, ([f"{value:.6g}" for value in row] for row in self.rows))
         validation.write(self.folder)
 

@@ -68,7 +68,8 @@ def checks() -> Iterator[Check]:
     yield Check("holosplat", f"{__version__} in {Path(__file__).resolve().parents[1]}")
     python = f"{platform.python_version()} at {sys.executable}, {platform.platform()}"
     yield Check("Python", python, "" if sys.version_info >= (3, 11) else "install Python 3.11 or newer.")
-    kind = f"CUDA {torch.version.cuda}" if torch.version.cuda else "CPU only"
+    idle = "" if torch.cuda.is_available() else ", but no GPU is here: PyTorch's CPU build does as much in less room"
+    kind = f"CUDA {torch.version.cuda}{idle}" if torch.version.cuda else "CPU only"
     yield Check("torch", f"{torch.__version__} ({kind}), MKL {'yes' if torch.backends.mkl.is_available() else 'no'}")
     for backend in DESCRIPTIONS:
         if backend != "reference":

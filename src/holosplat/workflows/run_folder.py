@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
-import os
 import secrets
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
@@ -17,7 +15,7 @@ import numpy as np
 
 from ..checks import as_written, require, require_regular
 from ..display import card, of_object
-from ..io.atomic import atomic_path
+from ..io.atomic import atomic_path, write_state
 from ..io.folder import require_new, require_parent
 from ..io.json import read_json, write_json
 from ..io.lock import sole_writer
@@ -201,14 +199,7 @@ class RunFolder:
 
     def save_checkpoint(self, state: dict[str, Any]) -> None:
         """Replace checkpoint.pt; the one before is kept beside it."""
-        import torch
-
-        content = io.BytesIO()
-        torch.save(self.marks() | {"state": _in_main_memory(state)}, content)
-        with atomic_path(self.checkpoint) as temporary:
-            temporary.write_bytes(content.getbuffer())
-            if self.checkpoint.is_file():
-                os.replace(self.checkpoint, self.earlier_checkpoint)
+        write_state(self.checkpoint, self.marks() | {"state": _in_main_memory(state)}, self.earlier_checkpoint)
 
     def load_checkpoint(self) -> dict[str, Any] | None:
         """The last checkpoint, or the one before if that is damaged or not there; None if there is none.

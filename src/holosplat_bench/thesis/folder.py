@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from holosplat.checks import as_written, require
-from holosplat.io.atomic import atomic_path, write_rows
+from holosplat.io.atomic import atomic_path, write_rows, write_state
 from holosplat.io.folder import require_new
 from holosplat.io.guard import read_archive
 from holosplat.io.json import read_json, write_json
@@ -96,10 +94,7 @@ class StudyFolder:
 
     def save_checkpoint(self, name: str, state: dict[str, Any]) -> None:
         """NAME.checkpoint.pt."""
-        content = io.BytesIO()
-        torch.save(state, content)
-        with atomic_path(self._file(name, "checkpoint.pt")) as temporary:
-            temporary.write_bytes(content.getbuffer())
+        write_state(self._file(name, "checkpoint.pt"), state)
 
     def load_checkpoint(self, name: str) -> dict[str, Any] | None:
         """What NAME.checkpoint.pt holds; None where there is none, or it is damaged: the configuration starts anew."""
