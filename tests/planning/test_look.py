@@ -27,6 +27,7 @@ def test_noise_alone_shows_nothing():
     look = looked(waves(8.0, 0.0, 0.05))
     assert look.spectrum.finest is None
     assert "below the noise" in look.fringes(np.array([2.0, 2.5]))
+    assert look.fringes(np.zeros(2)).startswith("none in contact;")
     assert look.air == pytest.approx(2.0, rel=0.01)
 
 

@@ -16,7 +16,7 @@ from holosplat.methods import METHODS, Auto
 from holosplat.model import measure
 from holosplat.optics.detector import poisson
 from holosplat.planning import seen as looking
-from holosplat.planning.needs import UNSEEN, Needs, Seen, Sizes, of_reconstruction
+from holosplat.planning.needs import UNSEEN, Needs, Seen, Sizes, of_choice, of_reconstruction
 from holosplat.planning.seen import seen_of
 from holosplat.representations import SurfaceMesh
 from holosplat.scan import Exposures, Scan
@@ -66,7 +66,7 @@ def test_runs_in_windows_take_what_was_measured(row):
     assert 0.8 < said.memory / GIB / float(row["peak_gib"]) < 1.5
     assert 1 / 1.5 < said.seconds / float(row["cpu_seconds"]) < 1.5
     assert said.seconds < 0.6 * of_reconstruction(whole, Auto(), "levels").seconds
-    assert said.most_seconds == 0
+    assert said.most_seconds >= said.seconds  # where surfaces of coarse pixels show too little
 
 
 @pytest.mark.parametrize("row", WHOLE, ids=lambda row: row["pixels"])
@@ -96,7 +96,7 @@ def test_what_is_not_known_of_matter_takes_what_either_kind_takes():
     )
     assert levels.most_seconds > levels.seconds > of_reconstruction(sizes, Auto(), "levels").seconds
     assert either.seconds == min(levels.seconds, continuous.seconds)
-    assert either.most_seconds == max(levels.most_seconds, continuous.seconds)
+    assert either.most_seconds == max(levels.most_seconds, continuous.seconds) + of_choice(sizes, Auto())
     assert either.memory == max(levels.memory, continuous.memory)
 
 

@@ -12,6 +12,7 @@ from holosplat.report import (
     render_page,
     view_labels,
 )
+from holosplat.report.blocks import _ends
 from holosplat.report.content import flatten
 from holosplat.report.style import format_length, in_print, scientific
 from holosplat.report.surface import camera
@@ -94,4 +95,20 @@ def test_labels_numbers_and_settings_read_well():
     assert format_length(9.999e-7).replace("\u00a0", " ") == "1 µm"
     assert percent(-0.0123) == "−1.2 %"
     assert percent(None) == "–"
+    assert percent(-1e-9) == percent(0.0) == "0 %"
+
+
+def test_ends_of_values_that_are_rounding_are_zero():
+    assert _ends(np.array([-4.9e-22, 7.4e-7])) == (0.0, 7.4e-7)
+    assert _ends(np.array([-4.9e-9, 7.4e-7])) == (-4.9e-9, 7.4e-7)
     assert [duration(t) for t in (1.25, 54.2, 600, 3700)] == ["1.2 s", "54 s", "10 min 00 s", "1 h 01 min"]
+
+
+def test_a_volume_below_half_of_its_material_says_that_no_surface_is_drawn(undrawn_reports):
+    """Gaussians of a single view were drawn as an empty box, with β said to be zero."""
+    shown = content()
+    thin = replace(shown.reconstruction, delta=0.3 * shown.reconstruction.delta)
+    page = Page(render_page(replace(shown, reconstruction=thin, material_delta=shown.surface_material()))).text
+    assert "No voxel of the reconstruction reaches it." in page
+    assert "No voxel of the reconstruction does." in page
+    assert "β is zero" not in page

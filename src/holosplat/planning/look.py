@@ -94,7 +94,7 @@ class Look:
             else (f"contrast is above the noise down to periods of {two_digits(finest)} pixels")
         )
         width = low if low == high else f"{low} to {high}"
-        return f"first fringe √(λz) {width} pixels; {said}"
+        return f"first fringe √(λz) {width} pixels; {said}" if widths.any() else f"none in contact; {said}"
 
 
 def looked(frames: np.ndarray) -> Look:

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -28,6 +28,7 @@ from ..methods import (
     Voxels,
 )
 from ..methods.coarse_cloud import MOST_GAUSSIANS
+from ..methods.first_volumes import FEWEST, MANY, MOST, WIDTH
 from ..optics.sampling import fringe_sampling, padding
 from ..scan import Exposures
 from ..units import two_digits
@@ -85,6 +86,8 @@ class Costs:
     """Seconds of a run whose fit takes none: the program, decisions about light and noise, judging and the report."""
     turns: float = 2.5
     """Times what a fit of Gaussians takes: that, and the turns of surfaces and volume that may follow in noise."""
+    beside: float = 12.0
+    """Seconds of a run that a fit to coarse frames within it does not take: the program, judging and the report."""
 
 
 SAFETY = 1.1
@@ -93,8 +96,6 @@ KEPT = 4
 """Copies of an object that a run folder may hold: itself, two checkpoints with their optimiser, one being written."""
 FULL = 0.03
 """Share of a large field that is taken to be full of matter."""
-BINNINGS, FEWEST_COLUMNS = range(2, 9), 11
-"""What is tried for --bin, and columns that must be left."""
 
 
 @dataclass(frozen=True)
@@ -149,22 +150,27 @@ def on_larger_pixels(exposures: Exposures, binning: int) -> Exposures:
 
 @dataclass(frozen=True)
 class Needs:
-    """Peak resources of a job: memory and disk [bytes], processor time of all cores together [s];
-    most_seconds: the same where what is found in the frames may make it longer (0: it cannot)."""
+    """Peak resources of a job: memory, at most, and disk [bytes], processor time of all cores together [s];
+    most_seconds, least_memory: the same where what is found in the frames may change them (0: it cannot)."""
 
     memory: float
     disk: float
     seconds: float = 0.0
     most_seconds: float = 0.0
+    least_memory: float = 0.0
 
     def line(self) -> str:
         """In words."""
-        time = f", and about {_times(self.seconds, self.most_seconds)} of processor time" if self.seconds else ""
-        return f"takes about {_size(self.memory)} of memory, {_size(self.disk)} on the disk{time}"
+        time = f", and about {_between(time_in_words, self.seconds, self.most_seconds)} of processor time" * (
+            self.seconds > 0
+        )
+        memory = _between(_size, self.least_memory or self.memory, self.memory)
+        return f"takes about {memory} of memory, {_size(self.disk)} on the disk{time}"
 
     def times(self, count: int) -> Needs:
         """Resources of so many of the same, one after the other."""
-        return Needs(self.memory, count * self.disk, count * self.seconds, count * self.most_seconds)
+        seconds, most = count * self.seconds, count * self.most_seconds
+        return replace(self, disk=count * self.disk, seconds=seconds, most_seconds=most)
 
     def fit(self, path: Path) -> bool:
         """Whether there is so much memory, and disk at `path`."""
@@ -193,23 +199,48 @@ def of_reconstruction(
     if isinstance(method, Auto) and matter is None:
         each = [one for kind in KINDS if (one := of_reconstruction(sizes, method, kind, seen)) is not None]
         times = [time for one in each for time in (one.seconds, one.most_seconds or one.seconds)]
-        return replace(max(each, key=lambda one: one.memory), seconds=min(times), most_seconds=max(times))
+        least = min(one.least_memory or one.memory for one in each)
+        most = max(times) + of_choice(seen.windows or sizes, method)
+        largest = max(each, key=lambda one: one.memory)
+        return replace(largest, seconds=min(times), most_seconds=most, least_memory=least)
     worked = seen.windows or sizes
-    fit = of_fit(worked, method, matter)
+    fit = of_fit(worked, _without_rounds(method) if seen.noisy else method, matter)
     if fit is None:
         return None
     if seen.windows is not None:
         fit = _judged(fit, sizes)
     if seen.noisy and (more := _in_noise(worked, method, matter)):
         fit = replace(fit, seconds=more, most_seconds=fit.seconds + Costs.turns * more)
-    return replace(fit, memory=with_report(sizes, fit.memory))
+    least = with_report(sizes, fit.least_memory) if fit.least_memory else 0.0
+    return replace(fit, memory=with_report(sizes, fit.memory), least_memory=least)
+
+
+def of_choice(sizes: Sizes, method: Auto) -> float:
+    """Seconds, at most, in which fits of both kinds to coarse frames decide, where first volumes do not
+    (`methods.levels`)."""
+    if sizes.views < FEWEST:
+        return 0.0
+    factor, folds = math.ceil(max(sizes.rows, sizes.columns) / WIDTH), MOST if sizes.views >= MANY else sizes.views
+    rows, columns = (max(1, n // factor) for n in (sizes.rows, sizes.columns))
+    coarse = replace(sizes, rows=rows, columns=columns, samples=factor * sizes.samples)
+    each = [of_fit(coarse, method, kind) for kind in KINDS]
+    return folds * sum(max(0.0, one.seconds - Costs.beside) for one in each if one is not None)
+
+
+def _without_rounds(method: Method) -> Method:
+    """A method whose bodies begin in noise, with a volume that agrees with no frames."""
+    if isinstance(method, Surfaces | Auto):
+        return replace(method, gaussians=_without_rounds(method.gaussians))
+    assert isinstance(method, Gaussians)
+    return replace(method, volume=replace(method.volume, corrections=0))
 
 
 def _judged(fit: Needs, whole: Sizes) -> Needs:
     """A fit in windows, with the judging of its result by whole frames."""
     finer = whole.waves(1)
-    memory = max(fit.memory, Costs.program + Costs.frames * whole.pixels + Costs.judged * finer)
-    return Needs(memory, fit.disk + Costs.written * whole.pixels, fit.seconds + Costs.judging * finer)
+    judged, more = Costs.program + Costs.frames * whole.pixels + Costs.judged * finer, Costs.judging * finer
+    least, most = fit.least_memory and max(fit.least_memory, judged), fit.most_seconds and fit.most_seconds + more
+    return Needs(max(fit.memory, judged), fit.disk + Costs.written * whole.pixels, fit.seconds + more, most, least)
 
 
 def _in_noise(sizes: Sizes, method: Method, matter: MatterKind | None) -> float:
@@ -236,12 +267,12 @@ def of_fit(sizes: Sizes, method: Method, matter: MatterKind | None = None) -> Ne
         kinds = (matter,) if matter else KINDS
         each = [of_fit(sizes, method.suited(kind)) for kind in kinds]
         return max((one for one in each if one is not None), key=lambda one: one.memory)
-    parts = _parts(sizes, method)
-    if parts is None:
+    beside = _beside(sizes, method)
+    if beside is None:
         return None
-    memory, seconds, numbers = parts
-    disk = Costs.written * (KEPT * numbers + sizes.pixels) + Costs.page
-    return Needs(Costs.program + Costs.frames * sizes.pixels + memory, disk, seconds)
+    rest = Costs.program + Costs.frames * sizes.pixels
+    disk, least = Costs.written * (KEPT * beside.disk + sizes.pixels) + Costs.page, beside.least_memory
+    return replace(beside, memory=rest + beside.memory, disk=disk, least_memory=least and rest + least)
 
 
 def with_report(sizes: Sizes, memory: float) -> float:
@@ -249,51 +280,61 @@ def with_report(sizes: Sizes, memory: float) -> float:
     return max(memory, Costs.frames * sizes.pixels + Costs.report + 0.5 * Costs.waves * sizes.waves())
 
 
-def _parts(sizes: Sizes, method: Method) -> tuple[float, float, float] | None:
-    """Bytes beside the program, seconds, and numbers of the object."""
+def _beside(sizes: Sizes, method: Method) -> Needs | None:
+    """Resources beside the program and the frames; disk: in numbers of the object."""
     if isinstance(method, PerView):
         memory = Costs.plain * sizes.voxels + Costs.rays * sizes.views * sizes.columns**2
-        return memory, Costs.run + 0.35e-6 * sizes.views * sizes.voxels, sizes.voxels
+        return Needs(memory, sizes.voxels, Costs.run + 0.35e-6 * sizes.views * sizes.voxels)
     if isinstance(method, SmoothVolume):
         small = sizes.joined(method.max_voxels)
         memory = max(Costs.smooth * small.voxels, of_start(small, method.volume))
-        return memory, 10 + 4.5e-6 * sizes.views * small.voxels, small.voxels
+        return Needs(memory, small.voxels, Costs.run + 4.5e-6 * sizes.views * small.voxels)
     if isinstance(method, HolographicVoxels | Voxels | NeuralFields):
         begun, fine = of_start(sizes, method.volume), _fine(sizes, method.volume)[0]
         if isinstance(method, HolographicVoxels):
-            return begun, Costs.run + 1.5e-6 * fine, fine
+            return Needs(begun, fine, Costs.run + 1.5e-6 * fine)
         fitted = Costs.waves * sizes.waves() + Costs.plain * sizes.voxels
-        return max(begun, fitted), 20 + 3e-6 * fine, sizes.voxels
+        return Needs(max(begun, fitted), sizes.voxels, 20 + 3e-6 * fine)
     if isinstance(method, Onix | PixelNerf):
         small, steps = sizes.joined(method.fit.max_voxels), method.fit.schedule.steps
         seen = small.views * small.voxels
         memory = Costs.points + Costs.aligned * small.voxels + Costs.place * seen + Costs.features * small.pixels
         memory += Costs.waves * sizes.waves()
-        return memory, 5 + 0.9e-6 * steps * seen, small.voxels
+        return Needs(memory, small.voxels, 5 + 0.9e-6 * steps * seen)
     gaussians = method if isinstance(method, Gaussians) else getattr(method, "gaussians", None)
     return _bodies(sizes, gaussians, gaussians is not method) if isinstance(gaussians, Gaussians) else None
 
 
-def _bodies(sizes: Sizes, how: Gaussians, edges: bool) -> tuple[float, float, float]:
-    """The same of Gaussians, and of surfaces cut out of them where there are `edges`."""
+def _bodies(sizes: Sizes, how: Gaussians, edges: bool) -> Needs:
+    """The same of Gaussians, and of surfaces cut out of them where there are `edges`.
+
+    Where surfaces of coarse pixels show the bodies, these are done sooner, and no fine volume is made.
+    """
     batch = how.fit.schedule.views_per_step
     fitted = replace(sizes, views=min(batch, sizes.views) if batch else sizes.views).waves()
     waves = max(Costs.waves * fitted, Costs.edges * sizes.waves(1) if edges else 0.0)
     begun = 0.0 if how.start == "random" else of_start(sizes, how.volume)
     count = how.random_count if how.start == "random" else min(how.max_start, how.start_per_pixel * sizes.pixels)
-    fine = _fine(sizes, how.volume)[0]
-    memory, numbers = max(begun, waves + Costs.gaussian * count), 14 * count
-    seconds, finer = _gaussian_seconds(fine, edges), sizes.waves(1)
-    near = 12 + 1.07e-5 * finer  # surfaces from coarse pixels on, where they show bodies
+    memory, seconds = max(begun, waves + Costs.gaussian * count), _gaussian_seconds(_work(sizes, how.volume), edges)
+    plain, finer = Needs(memory, 14 * count, seconds), sizes.waves(1)
+    near = 12 + 1.07e-5 * finer
     if how.start != "phase" or how.coarse.columns == 0:
-        return memory, seconds, numbers
+        return plain
     if edges:
-        return memory, near, numbers
+        least = max(of_start(sizes, replace(how.volume, corrections=0)), waves)
+        return replace(plain, seconds=near, most_seconds=max(near, seconds), least_memory=min(least, memory))
     if how.coarse.factor((sizes.rows, sizes.columns)) == 1:
-        return memory, seconds, numbers
+        return plain
     filled = min(MOST_GAUSSIANS, FULL * sizes.voxels)
     memory = max(memory, Costs.waves * finer + Costs.filling * filled)
-    return memory, max(seconds, near + 2e-7 * filled * sizes.views), 14 * filled
+    return Needs(memory, 14 * filled, max(seconds, near + 2e-7 * filled * sizes.views))
+
+
+def _work(sizes: Sizes, how: HolographicTV) -> float:
+    """Voxels of the rounds of agreement, as many as take the time of 12 views: few views have more steps a round, and
+    a fifth of a step does not depend on their number (128 × 128 pixels, one view)."""
+    steps = max(1.0, how.few_views / max(1, sizes.views))
+    return _fine(sizes, how)[0] * steps * (0.22 + 0.78 * min(sizes.views, 12) / 12)
 
 
 def _fine(sizes: Sizes, how: HolographicTV) -> tuple[int, int]:
@@ -335,50 +376,18 @@ def require_room(needs: Needs, path: Path, others: Iterable[tuple[str, Needs]] =
     )
 
 
-def smaller(exposures: Exposures, method: Method, matter: MatterKind | None) -> Iterator[tuple[str, Needs]]:
-    """The same reconstruction on larger voxels in the start, and on larger pixels; how, and what it takes then."""
-    flag, coarse = _one_voxel_a_pixel(method)
-    for factor in (1, *BINNINGS):
-        if factor > 1 and exposures.views.shape[1] // factor < FEWEST_COLUMNS:
-            return
-        sizes, bins = Sizes.of(exposures, factor), f"--bin {factor}" if factor > 1 else ""
-        for how, tried in ((bins, method), (f"{bins} {flag}".strip(), coarse)):
-            needs = of_reconstruction(sizes, tried, matter)
-            if needs is not None and how:
-                yield how, needs
-
-
-def coarser(exposures: Exposures, of: Callable[[Exposures], Needs]) -> Iterator[tuple[str, Needs]]:
-    """What `of` says of the same frames on larger pixels; how, and what it takes then."""
-    for factor in BINNINGS:
-        if exposures.views.shape[1] // factor < FEWEST_COLUMNS:
-            return
-        yield f"--bin {factor}", of(on_larger_pixels(exposures, factor))
-
-
-def _one_voxel_a_pixel(method: Method) -> tuple[str, Method]:
-    """A method whose start has voxels of one pixel, and the flag that makes it so; none where it has no such start."""
-    start = getattr(method, "volume", None)
-    if isinstance(start, HolographicTV) and isinstance(method, Gaussians | HolographicVoxels | Voxels | NeuralFields):
-        return "--set volume.refine=1", replace(method, volume=replace(start, refine=1))
-    if isinstance(method, Auto | Surfaces):
-        gaussians = method.gaussians
-        coarse = replace(gaussians, volume=replace(gaussians.volume, refine=1))
-        return "--set gaussians.volume.refine=1", replace(method, gaussians=coarse)
-    return "", method
-
-
 def _size(bytes_: float) -> str:
     return f"{two_digits(bytes_ / 1e9)} GB" if bytes_ >= 0.95e9 else f"{max(1.0, bytes_ / 1e6):.0f} MB"
 
 
-def _times(least: float, most: float) -> str:
-    """A range of times; the first alone where there is no other."""
-    first, last = _time(least), _time(max(least, most))
+def _between(words: Callable[[float], str], least: float, most: float) -> str:
+    """A range of times or sizes in `words`; the first alone where there is no other."""
+    first, last = words(least), words(max(least, most))
     return first if first == last else f"{first.removesuffix(last[last.index(' ') :])} to {last}"
 
 
-def _time(seconds: float) -> str:
+def time_in_words(seconds: float) -> str:
+    """In one unit, to about a digit."""
     if seconds < 90:
         return f"{max(1, round(seconds, -1)):.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

@@ -31,8 +31,9 @@ from ..scan import Exposures, Scan
 from ..units import span
 from .acts import of_each_time
 from .look import LOOKED, Look, looked
-from .needs import Sizes, of_reconstruction, require_room, smaller
+from .needs import Sizes, of_choice, of_reconstruction, require_room, time_in_words
 from .seen import seen_of
+from .smaller import smaller
 
 FIELDS = 3
 """Flats, and darks, that are read."""
@@ -224,4 +225,9 @@ def _needs(scan: Scan, numbers: np.ndarray) -> dict[str, str]:
             rows[name] = needs.line()
         except InputError as error:  # says what would fit
             rows[name] = str(error)
+    choice = of_choice(windows or Sizes.of(train.exposures), Auto())
+    if choice:
+        rows["either"] = (
+            f"up to about {time_in_words(choice)} more, where fits decide between the two (--matter says it)"
+        )
     return rows

@@ -91,6 +91,8 @@ def _scene(content: ReportContent) -> Block:
         f"Surfaces where {shown.symbol} = {shown.text(0.5 * material)}, half of the material's, seen from above. "
         f"The box is the volume, {size}\u00a0µm (x\u00a0×\u00a0y\u00a0×\u00a0z). "
     )
+    if not _reaches(content.reconstruction, 0.5 * material):
+        text += "No voxel of the reconstruction reaches it. "
     if content.truth is None:
         text += "a, from the first side; b, turned by 90° about the vertical axis. The truth is not known."
     else:
@@ -100,6 +102,11 @@ def _scene(content: ReportContent) -> Block:
             f"along its own normals: red outside, blue inside of it; colours end at one voxel, {voxel}."
         )
     return drawn_block(heading, text, "The scene and its reconstruction.", figure)
+
+
+def _reaches(volume: Volume, level: float) -> bool:
+    """Whether a voxel's δ is `level`, which has a sign, or more."""
+    return bool((volume.delta * np.sign(level) >= abs(level)).any())
 
 
 def _turned(content: ReportContent) -> Block:
@@ -183,7 +190,7 @@ def _projections(content: ReportContent) -> Block:
     text = "Phase φ = −kD with D = ∫δ dz, and absorption 2kB with B = ∫β dz" if told else "Absorption 2k∫β dz = ∫µ dz"
     text += f", at {content.energy_kev:g} keV, {' and '.join(maps.labels[:2])}. "
     values = -k * np.asarray(maps.projected_delta[:2]) if told else 2 * k * np.asarray(maps.projected_beta[:2])
-    low, high = scientific(float(values.min())), scientific(float(values.max()))
+    low, high = (scientific(end) for end in _ends(values))
     text += f"The reconstruction's {name} runs from {low} to {high}{' rad' * told}. "
     if maps.true_projected_delta is None:
         text += "The truth is not known."
@@ -192,11 +199,18 @@ def _projections(content: ReportContent) -> Block:
     return drawn_block(heading, text, "Line integrals through the object.", figure)
 
 
+def _ends(values: np.ndarray) -> tuple[float, float]:
+    """The least and the greatest of `values`; what single precision cannot tell from 0 beside the other is 0."""
+    ends = float(values.min()), float(values.max())
+    rounding = float(np.finfo(np.float32).eps) * max(map(abs, ends))
+    return tuple(end if abs(end) > rounding else 0.0 for end in ends)  # type: ignore[return-value]
+
+
 def _slices(content: ReportContent) -> Block:
     truth, delta, shown = content.truth, content.reconstruction.delta, content.quantity
     planes = richest_planes(content.reconstruction if truth is None else truth)
     figure = slices_figure(content.reconstruction, truth, planes, shown)
-    low, high = shown.text(float(delta.min())), shown.text(float(delta.max()))
+    low, high = (shown.text(end) for end in _ends(delta))
     text = (
         f"{shown.symbol} in the three orthogonal planes that hold most matter. "
         f"Over the whole volume the reconstruction's {shown.symbol} runs from {low} to {high}"
@@ -204,7 +218,7 @@ def _slices(content: ReportContent) -> Block:
     if truth is None:
         text += ". The truth is not known."
     else:
-        low, high = shown.text(float(truth.delta.min())), shown.text(float(truth.delta.max()))
+        low, high = (shown.text(end) for end in _ends(truth.delta))
         text += (
             f", the truth's from {low} to {high}. "
             "Truth and reconstruction share one colour scale; differences are reconstruction − truth."
@@ -246,7 +260,7 @@ def _history(content: ReportContent) -> Block:
     if figure is None:
         return Block(heading, "No course of the fit was recorded.")
     text = (
-        "Recorded while fitting, over the steps of the last fit; the loss and its terms on a logarithmic scale. They "
+        "Recorded while fitting, over the steps of the last fit; the loss, and its terms before their weights. They "
         "are means over the pixels of that step: where frames pass to finer pixels or terms join, the loss jumps, and "
         "only losses between two jumps compare."
     )
@@ -262,6 +276,8 @@ def _histograms(content: ReportContent) -> Block:
     text = f"The material's {shown.symbol} is {shown.text(material)}; matter is what exceeds half of it. "
     if not content.delta_told:
         text += "The frames show absorption alone: δ, and with it δ\u2060/\u2060β, is not known. "
+    elif not _reaches(content.reconstruction, 0.5 * material):
+        text += "No voxel of the reconstruction does. "
     elif outside is None:
         text += "β is zero in all matter, so δ\u2060/\u2060β is not defined. "
     else:

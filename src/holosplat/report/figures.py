@@ -14,7 +14,7 @@ from matplotlib.image import AxesImage
 
 from ..geometry import Grid
 from ..metrics import robust_material_delta
-from ..units import length_unit, wavenumber
+from ..units import length_unit, plain, wavenumber
 from ..volume import Volume
 from .content import DELTA, HeldOutViews, ProjectedMaps, Quantity, pixel_of
 from .style import (
@@ -296,7 +296,7 @@ def slice_titles(axes: list[Axes], first: int, name: str, grid: Grid, positions:
     for i, (panel, (plane, axis, _)) in enumerate(zip(axes, PLANES)):
         where = centres[axis][positions[axis]] * factor
         fixed = "zyx"[axis]
-        letter(panel, first + i, f"{name}, {plane} at {fixed} = {where:.1f} {unit}".replace("-", "−"))
+        letter(panel, first + i, f"{name}, {plane} at {fixed} = {plain(where, 4)} {unit}".replace("-", "−"))
 
 
 @styled

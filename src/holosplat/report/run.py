@@ -174,7 +174,7 @@ def _title(config: Mapping[str, Any], reconstruction: Reconstruction) -> str:
 def _summary(reconstruction: Reconstruction, scan: Scan, moving: Moving | None) -> str:
     exposures, views = scan.exposures, scan.views
     h, w = views.shape
-    distance = f"{span(100 * exposures.distance)} cm"
+    distance = f"{span(100 * exposures.distance)} cm behind the sample" if exposures.distance.any() else "in contact"
     energies = exposures.energy_kev.min(), exposures.energy_kev.max()
     energy = f"{energies[0]:g}" if exposures.has_one_energy else f"{energies[0]:g} to {energies[1]:g}"
     state = "" if reconstruction.finished else " The fit was interrupted before its end."
@@ -182,7 +182,7 @@ def _summary(reconstruction: Reconstruction, scan: Scan, moving: Moving | None) 
         state += f" Volumes, slices and projections are those at {1e6 * _middle(moving):.4g} µs."
     return (
         f"{len(scan.train())} training and {len(scan.test())} held-out frames of {h} × {w} pixels of "
-        f"{span(1e6 * views.pixel_sizes)} µm, {energy} keV, {distance} behind the sample; "
+        f"{span(1e6 * views.pixel_sizes)} µm, {energy} keV, {distance}; "
         f"{reconstruction.object.described}.{state}"
     )
 

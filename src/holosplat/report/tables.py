@@ -272,7 +272,8 @@ def percent(value: float | None) -> str:
     if value is None:
         return "–"
     digits = 2 if abs(value) < 0.00995 else 1
-    return f"{100 * value:+.{digits}f} %".replace("-", "−")
+    rounded = round(100 * value, digits)
+    return f"{rounded:+.{digits}f} %".replace("-", "−") if rounded else "0 %"
 
 
 def duration(seconds: float) -> str:
