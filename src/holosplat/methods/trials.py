@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import torch
 from torch import Tensor
 
 from ..backends import Backend
@@ -58,7 +57,7 @@ class Trial:
     @property
     def measured(self) -> Tensor:
         """The unseen frames [V, H, W]."""
-        return torch.from_numpy(self.unseen.frames)
+        return self.unseen.measured
 
     @cached_property
     def predicted(self) -> Tensor:
@@ -95,9 +94,9 @@ class Trials:
         if light is None:
             return False
         change = (light.factor() / before.light.factor() - 1).square().mean()
-        left = before.light.evened(torch.from_numpy(before.seen.frames)) - before.predicted
+        left = before.light.evened(before.seen.measured) - before.predicted
         power = float(change) + max(light.noise.grain_level**2 - before.light.noise.grain_level**2, 0.0)
-        return power > MARGIN**2 * float(left.double().square().mean())
+        return power > MARGIN**2 * float(left.double().square().nanmean())
 
     def score(self, name: str, fold: int) -> Score:
         """That of a hypothesis by its name, or of one of its `rivals`."""
@@ -116,7 +115,7 @@ class Trials:
 
     def _found(self, hypothesis: Hypothesis, fold: int) -> Light | None:
         if not hypothesis:
-            frames = torch.from_numpy(self._first.folds.split(fold)[0].frames)
+            frames = self._first.folds.split(fold)[0].measured
             return plain_light(frames, self._options)
         before = self.tried(hypothesis[:-1], fold)
         return with_more(before.light, hypothesis[-1], before.seen, before.predicted, self._options)
@@ -152,7 +151,7 @@ def plain_light(frames: Tensor, options: LightOptions) -> Light:
 def with_more(light: Light, hypothesis: str, seen: Scan, predicted: Tensor, options: LightOptions) -> Light | None:
     """`light` and what a hypothesis adds to it, by frames and their prediction [V, H, W] in even light; None where it
     cannot be: a pattern of one frame, or light where none shows air."""
-    frames = torch.from_numpy(seen.frames)
+    frames = seen.measured
     if hypothesis == "fixed pattern":
         return replace(light, still=fixed_pattern(light.evened(frames), predicted)) if len(seen) > 1 else None
     if hypothesis == "correlated noise":
