@@ -302,12 +302,20 @@ class Scan:
 
         return None if self.missing is None else torch.from_numpy(self.missing)
 
-    def left(self, predicted: Tensor) -> Tensor:
-        """The frames [N, H, W] less those predicted, 0 in missing pixels."""
+    @property
+    def measured(self) -> Tensor:
+        """The frames [N, H, W] as a tensor, NaN in missing pixels: for estimates of noise and light."""
         import torch
 
-        left = torch.from_numpy(self.frames) - predicted
-        return left if self.gaps is None else left.masked_fill(self.gaps, 0.0)
+        return self.known(torch.from_numpy(self.frames))
+
+    def known(self, images: Tensor) -> Tensor:
+        """Images [N, H, W] of the frames' pixels, NaN in missing ones."""
+        return images if self.gaps is None else images.masked_fill(self.gaps, float("nan"))
+
+    def left(self, predicted: Tensor) -> Tensor:
+        """The frames [N, H, W] less those predicted, 0 in missing pixels."""
+        return (self.measured - predicted).nan_to_num()
 
     @property
     def views(self) -> Views:

@@ -169,6 +169,38 @@ def test_pixels_that_are_none_or_too_few_are_refused(run, shape, dtype):
         np.asarray(read(run, {**SAID, "sources": "HPVX2_1"}).frames)
 
 
+def test_pixels_that_are_marked_or_dark_or_no_numbers_are_missing(tmp_path, angles):
+    """By the facility's mask, by flats that are no brighter than darks, and by what is written for them."""
+    counts = [counts_of(0), counts_of(1)]
+    counts[0][0, 1, 4, 7] = 60000
+    light, dark = np.full((2, TRAINS, PULSES, H, W), 930), np.full((2, TRAINS, PULSES, H, W), 30)
+    light[1, :, :, 3, 5] = 30
+    run, flats, darks = (
+        run_of(tmp_path / name, *values) for name, values in (("r", counts), ("flats", light), ("darks", dark))
+    )
+    mask = np.zeros((TRAINS, PULSES, H, W), "u4")
+    mask[0, 1, 4, 7] = 2
+    add_masks(run, mask, np.zeros_like(mask))
+    found = read_as(run, Reading(Told(**SAID, angles=angles, flats=flats, darks=darks)))
+    wanted = np.zeros((TRAINS, PULSES, 2, H, W), bool)
+    wanted[0, 1, 0, 4, 7] = wanted[:, :, 1, 3, 5] = True
+    np.testing.assert_array_equal(found.missing, wanted.reshape(-1, H, W))
+    assert found.frames.max() < 2
+    reading = Reading(Told(**SAID, sources="HPVX2_1", flats=flats, darks=darks))
+    correct(run, tmp_path / "out.nxs", CorrectionOptions("plain"), reading=reading)
+    corrected = read(tmp_path / "out.nxs")
+    assert corrected.missing is not None
+    assert corrected.missing.sum() == TRAINS * PULSES
+    assert corrected.missing[:, 4, 7].all()
+
+
+def add_masks(run: Path, *masks: np.ndarray) -> None:
+    """The mask of each camera, [trains, pulses, H, W], not 0 for defective pixels."""
+    with h5py.File(run / "RAW-R0007-DA01-S00000.h5", "r+") as file:
+        for n, mask in enumerate(masks):
+            file[f"INSTRUMENT/{CAMERA.format(n + 1)}:daqOutput/data/image/mask"] = mask
+
+
 def test_without_the_package_its_name_is_said(run, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "extra_data", None)
     euxfel._run.cache_clear()

@@ -6,20 +6,24 @@ from functools import cache
 
 import numpy as np
 import pytest
+import torch
 
+from holosplat.baselines import TOMOGRAPHIES
 from holosplat.beamline.simulate import simulate
-from holosplat.geometry import Views, rotation_y
+from holosplat.geometry import Grid, Views, rotation_y
 from holosplat.io.formats import read_as
 from holosplat.io.half_acquisition import stitched
 from holosplat.io.nxtomo import write_scan
 from holosplat.io.reading import Reading
 from holosplat.materials import parse_material
+from holosplat.optics.retrieval.contact import contact_thickness
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens import random_cells
 from holosplat.specimens.scene import MeshScene
 
 PITCH, H, WIDE, CUT = 1e-6, 16, 40, 26
 WATER = parse_material("water").delta_beta(20.0)
+SOFT = parse_material("water").delta_beta(8.0)
 
 
 @cache
@@ -54,6 +58,34 @@ def test_opposite_frames_complete_each_other(left, off):
     seen, true = found.frames[:, :, inside][:, :, there], known.frames[:4][:, :, columns[there]]
     left_out = float(np.linalg.norm(seen - true) / np.linalg.norm(true - 1))
     assert left_out < (0.1 if off else 1e-5)  # splines between pixels smooth fringes of a pixel
+
+
+def volume_beside_truth(scan: Scan, scene: MeshScene) -> tuple[np.ndarray, np.ndarray]:
+    """Occupancy by total variation, from the frames' absorption, and the true one on the same voxels."""
+    grid = Grid.of_views(scan.views)
+    thickness = contact_thickness(torch.from_numpy(scan.frames), scan.exposures, *SOFT)
+    found = TOMOGRAPHIES["tv"](thickness, scan.views, grid, 1.0, lambda fraction: None).numpy()
+    return found, np.asarray(scene.voxelise(grid).delta) / SOFT.delta
+
+
+def test_the_volume_is_that_of_frames_as_wide_as_the_sweep():
+    """Measured: error 0.22, correlation 0.98 and 1.10 of the matter, to three digits those of whole frames; frames by
+    themselves have 0.84 of the matter in their field."""
+    pitch, height, wide, count = 3.2e-6, 10, 72, 24
+    views = Views(rotation_y(np.arange(count) * 360 / count), np.zeros((count, 2)), (height, wide), pitch)
+    cells = random_cells(5, (60 * pitch, 9 * pitch, 60 * pitch), 3)
+    scene = MeshScene.of_one_material(cells, SOFT)
+    scan = simulate(scene, Exposures.of(views, 8.0, 0.0), is_test=np.zeros(count, bool))
+    cut = scan.cropped(slice(0, height), slice(wide - 42, wide))
+    found, true = volume_beside_truth(stitched(cut), scene)
+    whole, same = volume_beside_truth(scan[: count // 2], scene)
+    np.testing.assert_allclose(true, same, atol=1e-6)
+    assert np.linalg.norm(found - whole) < 1e-3 * np.linalg.norm(whole)
+    assert np.linalg.norm(found - true) == pytest.approx(0.223 * np.linalg.norm(true), rel=0.1)
+    assert np.corrcoef(found.ravel(), true.ravel())[0, 1] == pytest.approx(0.981, abs=0.005)
+    assert found.sum() == pytest.approx(1.10 * true.sum(), rel=0.02)
+    inside = np.asarray(scene.voxelise(Grid.of_views(cut.views)).delta).sum() / SOFT.delta
+    assert inside == pytest.approx(0.837 * true.sum(), rel=0.01)
 
 
 def test_frames_of_a_file_are_joined_unless_each_frame_is_wanted(tmp_path, caplog):

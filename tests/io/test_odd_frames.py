@@ -87,10 +87,19 @@ def test_flats_and_darks_that_are_mostly_the_other_are_refused(tmp_path, flats, 
         read_scan(raw_file(tmp_path / "raw.nxs", flats, darks))
 
 
-def test_dead_pixels_that_the_file_marks_need_no_flat(tmp_path):
-    path = raw_file(tmp_path / "raw.nxs", np.where(np.arange(SHAPE[1]) == 5, 0, FLATS), DARKS)
-    with pytest.raises(InputError, match="flat frames brighter than dark ones"):
+def test_dead_pixels_have_no_weight(tmp_path, caplog):
+    path = raw_file(tmp_path / "raw.nxs", np.where(np.arange(SHAPE[1]) < 6, 0, FLATS), DARKS)
+    with pytest.raises(
+        InputError, match="flats that are brighter than its darks, but in 25% of the pixels they are not"
+    ):
         read_scan(path)
+    path = raw_file(tmp_path / "raw.nxs", np.where(np.arange(SHAPE[1]) == 5, 0, FLATS), DARKS)
+    found = read_scan(path)
+    assert found.missing is not None
+    assert found.missing[:, :, 5].all()
+    assert found.missing.mean() == 1 / SHAPE[1]
+    assert f"{SHAPE[0]} pixels whose flats are not brighter than the darks are filled" in caplog.text
+    np.testing.assert_allclose(found.frames, (FRAMES - 10.0) / 5000, atol=3e-3)
     with h5py.File(path, "a") as file:
         file["entry/instrument/detector/pixel_mask"][:, 5] = 1
     np.testing.assert_allclose(read_scan(path).frames, (FRAMES - 10.0) / 5000, atol=3e-3)

@@ -14,20 +14,23 @@ import torch
 from helpers.cli import holosplat, worked
 from helpers.fit_balls import MATERIAL, PIXEL
 from helpers.runs import KNOWN, SMALL
+from holosplat.baselines import TOMOGRAPHIES
 from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
 from holosplat.fit.residuals import Prediction, residuals
 from holosplat.geometry import Grid, Views
 from holosplat.io.nxtomo import write_scan
 from holosplat.matter import Matter
+from holosplat.methods.method import Task
 from holosplat.model import smooth_modes
+from holosplat.optics.retrieval import paganin
 from holosplat.representations import VoxelGrid
 from holosplat.scan import Exposures, Scan
 from holosplat.workflows.evaluate import held_out_verdict
 from holosplat.workflows.next_step import STEPS, next_step
 from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
 from holosplat.workflows.run_folder import RunFolder
-from holosplat.workflows.verdict import Verdict, judge, verdict
+from holosplat.workflows.verdict import Verdict, judge, judge_run, verdict
 
 SHAPE = (25, 32)
 
@@ -240,3 +243,21 @@ def test_matter_that_goes_on_beyond_the_frames_is_named():
     wrong = on(whole, soft(0.6))  # as wrong, of whole bodies
     assert not wrong.good
     assert "goes on" not in wrong.reasons[0]
+
+
+def test_an_axis_elsewhere_is_the_cause_though_the_volume_has_followed_it():
+    """Noise alone, and matter about the axis that the scan says, name none."""
+    views = Views.evenly_spaced(12, SHAPE, PIXEL)
+    scan = simulate(soft(), Exposures.of(views, 20.0, 0.2, 0.3), photons_per_pixel=20000, seed=1)
+    away = views.shifts + np.array([3.2 * PIXEL, 0])
+    for measured, is_elsewhere in ((scan.with_views(replace(views, shifts=away)), True), (scan, False)):
+        task = Task(measured.as_static(), KNOWN)
+        lines = paganin(torch.from_numpy(measured.frames), measured.exposures, *MATERIAL)
+        grid = Grid.of_views(views)
+        values = 0.7 * TOMOGRAPHIES["fbp"](lines, measured.views, grid, None, lambda fraction: None)
+        found = judge_run(VoxelGrid(values[None], grid, Matter.one(*MATERIAL)), None, task, 1)
+        assert not found.good
+        assert (found.cause == "shift_x") == is_elsewhere
+        assert any("the axis of rotation is 3.2 ± " in reason for reason in found.reasons) == is_elsewhere
+        assert any("to the right of where the scan says" in reason for reason in found.reasons) == is_elsewhere
+    assert "holosplat align SCAN --axis-only" in replace(found, cause="shift_x").lines("training frames")[-1]

@@ -174,11 +174,28 @@ def _sinograms(scan: Scan, options: AxisOptions, ratio: float | None, light: Lig
     (h, w), p = views.shape, views.pixel_size
     images = shadows(scan, ratio, light).numpy()
     edges = np.linspace(0, h, min(options.bands, h) + 1).round().astype(int)
-    values = np.stack([images[:, a:b].mean(1) for a, b in pairwise(edges)], axis=1)
+    values = np.stack([_mean_row(images[:, a:b]) for a, b in pairwise(edges)], axis=1)
     heights = 0.5 * (edges[:-1] + edges[1:]) - h / 2 + views.shifts[0, 1] / p
+    seen = ~np.isnan(values).any(axis=(0, 2))  # slices that all views see
+    require(
+        bool(seen.any()), "an axis needs slices that all views see; leave out views without pixels that have a value."
+    )
+    values, heights = values[:, seen], heights[seen]
     sideways = views.shifts[:, :1] / p
     positions = np.arange(w) + 0.5 - w / 2 + (sideways[:1] if np.ptp(sideways) < 1e-9 else sideways)
     return Sinograms(values, _angles(views), positions, heights).binned(max(1, -(-w // options.columns)))
+
+
+def _mean_row(images: np.ndarray) -> np.ndarray:
+    """The mean row [V, W] of images [V, K, W] of which pixels that are NaN have no part; columns without any are those
+    between their neighbours. NaN in views that have none."""
+    known = ~np.isnan(images)
+    count, rows = known.sum(1), np.where(known, images, 0).sum(1)
+    rows = np.where(count > 0, rows / np.maximum(count, 1), np.nan)
+    for row, there in zip(rows, count > 0):
+        if there.any():
+            row[~there] = np.interp(np.flatnonzero(~there), np.flatnonzero(there), row[there])
+    return rows
 
 
 def _angles(views: Views) -> np.ndarray:

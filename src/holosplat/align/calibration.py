@@ -13,7 +13,7 @@ from ..geometry import Views
 from ..matter import Known, MaterialPrior
 from ..mesh import TriangleMesh
 from ..model import Alignment, Instrument
-from ..optics.background import Light, LightOptions
+from ..optics.background import LightOptions
 from ..optics.retrieval import Tikhonov, paganin, tikhonov
 from ..optics.sampling import fringe_sampling
 from ..progress import Progress
@@ -23,9 +23,10 @@ from .changes import changes, header, line
 from .derivatives import NUMBERS
 from .gauge import moved_onto
 from .initial_geometry import shifts_by_mass
+from .newton import unexplained
 from .phantom import STEPS, Linear, Phantom, find_beads, linearised, placed, solved
 from .poses import DISTANCE, FLUX, SHIFT, TURN, PosePrior
-from .shadows import EVEN_OR_NOT
+from .shadows import EVEN_OR_NOT, in_even_light
 from .views import KINDS
 
 UNTOLD = 0.5
@@ -139,8 +140,7 @@ def calibrate(
     require(not scan.is_series, "calibrate needs frames of one time; choose one with --time-frame.")
     if not isinstance(prior, Known):
         raise InputError("calibrate needs the phantom's material, of known density; say it by --material.")
-    frames = torch.from_numpy(scan.frames)
-    scan = replace(scan, frames=Light.of(frames, light).evened(frames).numpy())
+    scan = in_even_light(scan, light)
     search = _Search.begun(scan, prior, body, options, on_progress)
     for n, pixels in enumerate(search.bins):
         for done in range(options.rounds):
@@ -227,7 +227,7 @@ class _Search:
         places = torch.zeros(self.phantom.unknowns, dtype=torch.float64)
         sizes = torch.full((int(pixel > 0),), self.size, dtype=torch.float64)
         expected = torch.cat([places + FREE_PX, torch.full_like(sizes, pixel)])
-        frames = torch.from_numpy(scan.frames)
+        frames = scan.measured
         now = (self.numbers / scales, torch.cat([places, sizes]))
         after = solved(frames, found, now, (of_views, expected), self.options.blur)
         self.numbers = after.of_views * scales
@@ -245,7 +245,7 @@ class _Search:
         own = (deviations[len(deviations) - self.numbers.numel() :].reshape(self.numbers.shape) * scales).numpy()
         self.errors = own[:, :FLUX] * np.array([1, 1, *[np.rad2deg(1)] * 3, 1, 1])
         self.size_error = float(deviations[places]) if self.options.pixel > 0 else 0.0
-        left = (frames - seen).square().mean((1, 2)).sqrt() / frames.std(dim=(1, 2)).clamp_min(1e-12)
+        left = unexplained(frames, seen).square().mean((1, 2)).sqrt()
         self.left = left.double().numpy()
 
     def _centre(self) -> None:
@@ -290,7 +290,7 @@ def _thickness(scan: Scan, prior: Known, options: CalibrationOptions) -> np.ndar
     frames = torch.from_numpy(scan.frames)
     if options.retrieval:
         how = Tikhonov(iterations=options.retrieval)
-        found = tikhonov(frames, scan.exposures, *prior.material, options=how).double().numpy()
+        found = tikhonov(frames, scan.exposures, *prior.material, options=how, missing=scan.gaps).double().numpy()
     else:
-        found = paganin(frames, scan.exposures, *prior.material).double().numpy()
+        found = paganin(frames, scan.exposures, *prior.material, missing=scan.gaps).double().numpy()
     return np.where(found > FAINT * found.max(axis=(1, 2), keepdims=True), found, 0.0)

@@ -13,7 +13,7 @@ from ..inference import Decision, Score
 from ..matter import DeltaBeta, Known, MaterialPrior
 from ..methods.assumed import assumed_material
 from ..model import Alignment
-from ..optics.background import Light, LightOptions
+from ..optics.background import LightOptions
 from ..progress import Advance, Progress
 from ..scan import Exposures, Scan
 from .changes import changes, header, in_words, line
@@ -24,7 +24,7 @@ from .initial_geometry import SIDES, Images, RowGeometry, geometry_from_rows
 from .poses import DISTANCE, FLUX, SHIFT, TURN, Drift, Level, PoseOptions, PoseSearch
 from .row_sums import plane_angles
 from .series_search import Beams, Moment, SeriesSearch, chosen_moments, whens
-from .shadows import EVEN_OR_NOT
+from .shadows import EVEN_OR_NOT, in_even_light
 from .views import DEFAULT, FEW, FEWEST, PLANNED, AlignedViews, Judged, align_still, decided_poses
 
 DRIFT, STAY, LINEAR = "drift of the beams", "none", "linear in time"
@@ -81,12 +81,9 @@ class AlignedBeams(AlignedViews):
     measure: str
 
     def upright(self, frames: np.ndarray) -> np.ndarray:
-        """Frames [N, H, W] with those of reversed beams turned back, which is what the exposures are of."""
-        turned = frames.copy()
-        for n, side in enumerate(self.sides):
-            if side:
-                turned[n] = np.flip(frames[n], SIDES[side])
-        return turned
+        """Frames [N, H, W], or their missing pixels, with those of reversed beams turned back, which is what the
+        exposures are of."""
+        return _flipped(frames, self.sides)
 
     def lasting(self) -> np.ndarray:
         """[B] the first frames of all beams, whose exposures are those of the others.
@@ -188,17 +185,23 @@ def align_beams(
 
 def _divide_light(moment: Moment, light: LightOptions) -> Moment:
     """The same in even light."""
-    frames = torch.from_numpy(moment.scan.frames)
-    return replace(moment, scan=replace(moment.scan, frames=Light.of(frames, light).evened(frames).numpy()))
+    return replace(moment, scan=in_even_light(moment.scan, light))
 
 
 def _turned_back(moment: Moment, sides: tuple[str, ...]) -> Moment:
     """The same with the frames of reversed beams turned back."""
-    frames = moment.scan.frames.copy()
-    for k, beam in enumerate(moment.beams):
-        if sides[beam]:
-            frames[k] = np.flip(frames[k], SIDES[sides[beam]])
-    return replace(moment, scan=replace(moment.scan, frames=frames))
+    scan, own = moment.scan, [sides[beam] for beam in moment.beams]
+    missing = None if scan.missing is None else _flipped(scan.missing, own)
+    return replace(moment, scan=replace(scan, frames=_flipped(scan.frames, own), missing=missing))
+
+
+def _flipped(images: np.ndarray, sides: Sequence[str]) -> np.ndarray:
+    """Images [N, H, W], each mirrored along its side, if it has one."""
+    turned = images.copy()
+    for n, side in enumerate(sides):
+        if side:
+            turned[n] = np.flip(images[n], SIDES[side])
+    return turned
 
 
 def _rows(

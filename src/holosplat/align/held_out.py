@@ -53,14 +53,14 @@ def place_frames(
     for level in levels:
         binned = scan.binned(level.pixels)
         occupied, grid = _occupancy(found, binned, material)
-        frames, oversample = torch.from_numpy(binned.frames), fringe_sampling(binned.exposures)
+        frames, oversample = binned.measured, fringe_sampling(binned.exposures)
         for _ in range(level.rounds):
             search.move(occupied, grid, search.exposures(binned.exposures), frames, oversample)
             done += 1
             on_progress(STAGE, done / rounds)
     search.numbers[:, DISTANCE] = 0
     beside = Beside(found, scan.exposures, oversample or fringe_sampling(scan.exposures))
-    measured, nothing = torch.from_numpy(scan.frames), torch.zeros_like(search.numbers)
+    measured, nothing = scan.measured, torch.zeros_like(search.numbers)
     moved = beside.placed(measured, search.numbers, _expected(options))
     tried = [
         rms_of(unexplained(measured, beside.frames(numbers))) for numbers in (nothing, search.numbers, moved.numbers)
@@ -94,7 +94,7 @@ def _occupancy(found: Stored, scan: Scan, material: DeltaBeta) -> tuple[Tensor, 
 def _by_mass(found: Stored, scan: Scan, material: DeltaBeta, options: PoseOptions) -> Tensor:
     """Shifts [V, 2] [pixels of `scan`] that bring the centres of mass of frames to those of the matter."""
     how = Tikhonov(iterations=options.retrieval)
-    thickness = tikhonov(torch.from_numpy(scan.frames), scan.exposures, *material, options=how)
+    thickness = tikhonov(torch.from_numpy(scan.frames), scan.exposures, *material, options=how, missing=scan.gaps)
     with torch.no_grad():
         _, lines = found.project(scan.views)
     expected, seen = (centres_of_mass(images.double().numpy()) for images in (lines, thickness))
@@ -115,7 +115,7 @@ def fitted_frames(found: Stored, planned: Scan, fitted: Scan, options: PoseOptio
     """
     numbers = torch.zeros(len(planned), len(NUMBERS), dtype=torch.float64)
     numbers[:, :FLUX] = numbers_of(fitted.exposures, planned.exposures)
-    measured, nothing = torch.from_numpy(fitted.frames), torch.zeros_like(numbers)
+    measured, nothing = fitted.measured, torch.zeros_like(numbers)
     beside = Beside(found, planned.exposures, oversample or fringe_sampling(planned.exposures))
     errors = errors_of(beside.placed(measured, numbers, _expected(options), steps=0).covariances)
     before, after = (rms_of(unexplained(measured, beside.frames(each))) for each in (nothing, numbers))

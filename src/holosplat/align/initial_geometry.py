@@ -52,7 +52,7 @@ def mirrored(frames: Tensor, predicted: Tensor) -> list[str]:
     images = {"": frames, **{side: frames.flip(axes) for side, axes in SIDES.items()}}
     found = list[str]()
     for v in range(len(frames)):
-        scores = {side: Score.of(image[[v]] - predicted[[v]]) for side, image in images.items()}
+        scores = {side: Score.of((image[[v]] - predicted[[v]]).nan_to_num()) for side, image in images.items()}
         found.append(select("mirrored", tuple(scores), lambda side, fold, of=scores: of[side], by="a frame").choice)
     return found
 
@@ -107,7 +107,10 @@ class Images:
     def of(cls, scans: Sequence[Scan], when: Sequence[float], material: DeltaBeta, steps: int) -> Images:
         """Retrieved in `steps`, of scans of the same views."""
         how, first = Tikhonov(iterations=steps), scans[0]
-        found = [tikhonov(torch.from_numpy(scan.frames), scan.exposures, *material, options=how) for scan in scans]
+        found = [
+            tikhonov(torch.from_numpy(scan.frames), scan.exposures, *material, options=how, missing=scan.gaps)
+            for scan in scans
+        ]
         values = torch.stack(found).double().numpy() / first.views.pitch
         return cls(values, in_pixels(first.views), first.is_test, np.asarray(when))
 

@@ -322,7 +322,7 @@ def _information(
         grid,
         exposures,
         search.material,
-        left=blurred(torch.from_numpy(scan.frames)[train] / lit - images, blur).square().mean((1, 2)),
+        left=blurred((scan.measured[train] / lit - images).nan_to_num(), blur).square().mean((1, 2)),
         leeway=SOFT if surfaces is None else SHARP,
         blur=blur,
         places=[SLOPES[place] for place in places],

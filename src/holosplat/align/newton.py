@@ -25,13 +25,14 @@ class Normal:
 
     @classmethod
     def of(cls, measured: Tensor, found: Predicted, blur: float) -> Normal:
-        """measured: frames [V, H, W]; found: at the present numbers, flux included; blur: standard deviation of a
-        Gaussian [pixels] by which images are compared. The noise of a view is what it leaves unexplained, as it is
-        after that blur: this many independent pixels."""
-        missing = blurred(measured - found.frames, blur).flatten(1).double()
-        columns = blurred(found.derivatives, blur).flatten(2).double()
+        """measured: frames [V, H, W], NaN in pixels without a value; found: at the present numbers, flux included;
+        blur: standard deviation of a Gaussian [pixels] by which images are compared. The noise of a view is what it
+        leaves unexplained, as it is after that blur: this many independent pixels."""
+        known = ~measured.isnan()
+        missing = blurred((measured - found.frames).nan_to_num(), blur).flatten(1).double()
+        columns = blurred(found.derivatives * known[:, None], blur).flatten(2).double()
         independent = 1 / (4 * math.pi * blur**2)
-        scale = independent / missing.square().mean(1).clamp_min(1e-18)
+        scale = independent / (missing.square().sum(1) / known.sum((1, 2))).clamp_min(1e-18)
         information = torch.einsum("vip,vjp->vij", columns, columns) * scale[:, None, None]
         return cls(information, torch.einsum("vip,vp->vi", columns, missing) * scale[:, None])
 
@@ -74,8 +75,14 @@ def blurred(images: Tensor, sigma: float) -> Tensor:
 
 
 def unexplained(measured: Tensor, images: Tensor) -> Tensor:
-    """[V, H, W] what images leave of frames, over each frame's contrast."""
-    return (measured - images) / measured.std(dim=(1, 2), keepdim=True).clamp_min(1e-12)
+    """[V, H, W] what images leave of frames, over each frame's contrast; 0 in pixels of these that are NaN."""
+    return (measured - images).nan_to_num() / contrast_of(measured)
+
+
+def contrast_of(measured: Tensor) -> Tensor:
+    """[V, 1, 1] standard deviation of frames [V, H, W] in pixels that are not NaN."""
+    away = (measured - measured.nanmean(dim=(1, 2), keepdim=True)).square().nansum(dim=(1, 2), keepdim=True)
+    return (away / ((~measured.isnan()).sum(dim=(1, 2), keepdim=True) - 1)).sqrt().clamp_min(1e-12)
 
 
 def rms_of(images: Tensor) -> np.ndarray:

@@ -282,15 +282,17 @@ def solved(
 ) -> Solution:
     """One Gauss–Newton step of all numbers together, damped by what is expected of them.
 
-    measured: [V, H, W]; numbers: of views [V, 8] and of all [K], now; expected: [8] and [K] standard deviations about
-    zero, 0 for those that stay. The noise of a view is what it leaves unexplained after a Gaussian of `blur` [pixels].
+    measured: [V, H, W], NaN in pixels without a value; numbers: of views [V, 8] and of all [K], now; expected: [8] and
+    [K] standard deviations about zero, 0 for those that stay. The noise of a view is what it leaves unexplained after a
+    Gaussian of `blur` [pixels].
     """
     views, count = len(measured), len(numbers[1])
-    missing = blurred(measured.double() - found.frames, blur).flatten(1)
-    of_views = blurred(found.of_views, blur).flatten(2)
-    of_all = (blurred(found.of_all, blur) if count else found.of_all).flatten(2)
+    known = ~measured.isnan()
+    missing = blurred((measured.double() - found.frames).nan_to_num(), blur).flatten(1)
+    of_views = blurred(found.of_views * known[:, None], blur).flatten(2)
+    of_all = (blurred(found.of_all * known, blur) if count else found.of_all).flatten(2)
     independent = 1 / (4 * math.pi * blur**2)
-    scale = independent / missing.square().mean(1).clamp_min(1e-18)
+    scale = independent / (missing.square().sum(1) / known.sum((1, 2))).clamp_min(1e-18)
     size = count + len(NUMBERS) * views
     information, slope = torch.zeros(size, size, dtype=torch.float64), torch.zeros(size, dtype=torch.float64)
     information[:count, :count] = torch.einsum("kvp,lvp,v->kl", of_all, of_all, scale)

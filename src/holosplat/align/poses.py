@@ -202,7 +202,9 @@ class PoseSearch:
         """Shifts by centres of mass, for a start; turns and distances as planned."""
         scan = self.scan.binned(self.levels()[0].pixels)
         how = Tikhonov(iterations=self.options.retrieval)
-        thickness = tikhonov(torch.from_numpy(scan.frames), scan.exposures, *self.material, options=how)
+        thickness = tikhonov(
+            torch.from_numpy(scan.frames), scan.exposures, *self.material, options=how, missing=scan.gaps
+        )
         shifts = shifts_by_mass(thickness.double().numpy(), scan.views)
         pixels = scan.views.pitch / self.scan.views.pitch
         self.numbers[:, SHIFT] = torch.from_numpy(shifts) * pixels
@@ -217,7 +219,7 @@ class PoseSearch:
         """[V, H, W] what the volume leaves of the frames of `scan`, on its pixels, over their contrast."""
         grid, found = Grid.of_views(in_pixels(scan.views)), self.exposures(scan.exposures)
         images = predicted(self.volume, grid, found, self.material, fringe_sampling(scan.exposures)).frames
-        return unexplained(torch.from_numpy(scan.frames), self.numbers[:, FLUX].exp().float()[:, None, None] * images)
+        return unexplained(scan.measured, self.numbers[:, FLUX].exp().float()[:, None, None] * images)
 
     def run(self, level: Level, on_progress: Advance) -> None:
         """The rounds of a level, until steps of the shifts are within their standard errors, or fall no longer."""
@@ -251,9 +253,9 @@ class PoseSearch:
         """Some steps of the volume, and what the frames then say of the numbers."""
         found = self.exposures(at.scan.exposures)
         train = np.flatnonzero(~at.scan.is_test)
-        self._improve_volume(LatticeProjector(at.grid, in_pixels(found.views)[train]), at.grid, at.retrieved)
+        self._improve_volume(LatticeProjector(at.grid, in_pixels(found.views)[train]), at)
         assert self._solver is not None
-        return self.normal(self._solver.volume, at.grid, found, torch.from_numpy(at.scan.frames), at.oversample)
+        return self.normal(self._solver.volume, at.grid, found, at.scan.measured, at.oversample)
 
     def thickness(self, scan: Scan, exposures: Exposures) -> Tensor:
         """Retrieved thickness [m] of the training frames of `scan`, on pixels of any size, in `exposures`.
@@ -264,35 +266,37 @@ class PoseSearch:
         as_planned = np.array_equal(exposures.optical.distance, self.scan.exposures.optical.distance)
         if as_planned and pixels in self._retrieved:
             return self._retrieved[pixels]
-        train, how = np.flatnonzero(~scan.is_test), Tikhonov(iterations=self.options.retrieval)
-        frames = torch.from_numpy(scan.frames)[train]
-        found = tikhonov(frames, exposures[train], *self.material, options=how)
+        train, how = scan[np.flatnonzero(~scan.is_test)], Tikhonov(iterations=self.options.retrieval)
+        seen = exposures[np.flatnonzero(~scan.is_test)]
+        found = tikhonov(torch.from_numpy(train.frames), seen, *self.material, options=how, missing=train.gaps)
         if as_planned:
             self._retrieved[pixels] = found
         return found
 
-    def _improve_volume(self, projector: LatticeProjector, grid: Grid, retrieved: Tensor) -> None:
+    def _improve_volume(self, projector: LatticeProjector, at: Prepared) -> None:
         """Some steps of total-variation tomography in the poses as they are now."""
-        options, before = self.options, self._solver
+        options, before, grid = self.options, self._solver, at.grid
+        seen = {"images": at.retrieved, "gaps": at.scan.train().gaps}
         first, steps = (math.ceil(self._more * count) for count in (options.first, options.steps))
         if before is None:
             self._solver = PrimalDual(projector, torch.zeros(grid.shape), options.weight, self.upper)
-            self._solver.run(retrieved, first)
+            self._solver.run(iterations=first, **seen)
             return
         if before.volume.shape == torch.Size(grid.shape):
             self._solver = before.on_finer(projector, 1, options.weight)
         else:
             finer = interpolate(before.volume[None, None], size=grid.shape, mode="trilinear", align_corners=False)
             self._solver = PrimalDual(projector, finer[0, 0], options.weight, self.upper)
-            self._solver.run(retrieved, max(0, first - steps))
-        self._solver.run(retrieved, steps)
+            self._solver.run(iterations=max(0, first - steps), **seen)
+        self._solver.run(iterations=steps, **seen)
 
     def move(self, volume: Tensor, grid: Grid, found: Exposures, frames: Tensor, oversample: int) -> None:
         """One step of all numbers beside `volume` on `grid` (lengths in pixels); found: exposures as they are now."""
         self.solve(self.normal(volume, grid, found, frames, oversample), found.views.shape)
 
     def normal(self, volume: Tensor, grid: Grid, found: Exposures, frames: Tensor, oversample: int) -> Normal:
-        """Information of frames [V, H, W] on the parameters (shifts in detector pixels), given `volume` on `grid`."""
+        """Information of frames [V, H, W], NaN in pixels without a value, on the parameters (shifts in detector
+        pixels), given `volume` on `grid`."""
         scales = torch.ones(len(NUMBERS), dtype=torch.float64)
         scales[SHIFT] = round(found.views.pitch / self.scan.views.pitch)
         magnified = self.options.uncertain.magnification > 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
 from ..optics.background import Light, LightOptions
@@ -17,13 +19,20 @@ TRIAL_DELTA = 1e-6
 
 
 def shadows(scan: Scan, ratio: float | None = None, light: LightOptions = EVEN_OR_NOT) -> torch.Tensor:
-    """Images [V, H, W], float64, of what each frame has lost: `-ln I` in even light, or Paganin's thickness.
+    """Images [V, H, W], float64, of what each frame has lost: `-ln I` in even light, or Paganin's thickness; NaN in
+    missing pixels.
 
     ratio: δ/β, if it is known; then fringes become thickness (in units of their own). Without it fringes stay: where
     they are weak, `-ln I` is a round filter of the projected matter (Teague 1983), and as consistent as projections.
     """
-    frames = torch.from_numpy(scan.frames)
-    evened = Light.of(frames, light).evened(frames)
-    if ratio is not None and bool(scan.exposures.distance.all()):
-        return paganin(evened, scan.exposures, TRIAL_DELTA, TRIAL_DELTA / ratio).double() / scan.views.pixel_size
-    return -evened.double().clamp_min(DARKEST).log()
+    evened = torch.from_numpy(in_even_light(scan, light).frames)
+    if ratio is None or not bool(scan.exposures.distance.all()):
+        return -scan.known(evened).double().clamp_min(DARKEST).log()
+    lost = paganin(evened, scan.exposures, TRIAL_DELTA, TRIAL_DELTA / ratio, missing=scan.gaps)
+    return scan.known(lost).double() / scan.views.pixel_size
+
+
+def in_even_light(scan: Scan, light: LightOptions = EVEN_OR_NOT) -> Scan:
+    """The scan as it would be in even light."""
+    frames = Light.of(scan.measured, light).evened(torch.from_numpy(scan.frames))
+    return replace(scan, frames=frames.numpy())

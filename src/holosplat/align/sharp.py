@@ -64,8 +64,10 @@ def sharpened(scan: Scan, numbers: Tensor, start: SurfaceMesh, search: PoseOptio
     """
     train, test = np.flatnonzero(~scan.is_test), np.flatnonzero(scan.is_test)
     options = SurfaceFit(schedule=Schedule(steps=search.edges, decay=DECAY), backend="cpu")
-    frames, lit = torch.from_numpy(scan.frames), numbers[:, FLUX].exp().float()[:, None, None]
-    begin = replace(scan, frames=(frames / lit).numpy(), exposures=aligned(numbers).exposures(scan.exposures))[train]
+    frames, lit = scan.measured, numbers[:, FLUX].exp().float()[:, None, None]
+    begin = replace(
+        scan, frames=(torch.from_numpy(scan.frames) / lit).numpy(), exposures=aligned(numbers).exposures(scan.exposures)
+    )[train]
     uncertain = search.uncertain
     freedom = replace(uncertain.freedom(numbers[train, :FLUX].numpy()), edges=True)
     fit = surface_fit(begin, start, options, freedom=freedom)

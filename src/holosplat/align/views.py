@@ -17,7 +17,7 @@ from ..inference import Decision, Score, select
 from ..matter import DeltaBeta, Known, MaterialPrior
 from ..methods.assumed import assumed_material
 from ..methods.surface_fit import oversampling
-from ..optics.background import Light, LightOptions
+from ..optics.background import LightOptions
 from ..optics.sampling import fringe_sampling
 from ..progress import Progress
 from ..projectors.voxels import LatticeProjector
@@ -29,9 +29,10 @@ from .fixed_matter import Beside
 from .gauge import moved_onto
 from .initial_geometry import mirrored
 from .marginal_likelihood import KINDS, beside_unknown
+from .newton import unexplained
 from .null_space import hardly_told
 from .poses import DISTANCE, FLUX, SHIFT, PoseOptions, PoseSearch
-from .shadows import EVEN_OR_NOT
+from .shadows import EVEN_OR_NOT, in_even_light
 from .sharp import EDGES, SURFACES, VOXELS, sharpened, surfaces_of
 
 SEED = 0
@@ -67,7 +68,7 @@ def rehearsed(done: Searched, again: ScanSearch) -> np.ndarray:
     """
     scan, search = done.search.scan.binned(done.pixels), done.search
     images = _frames(done, scan)
-    left = torch.from_numpy(scan.frames) - images
+    left = scan.left(images)
     frames = images + with_random_phases(left, SEED)
     options = replace(
         search.options, uncertain=replace(search.options.uncertain, shift=search.options.uncertain.shift / done.pixels)
@@ -178,8 +179,7 @@ def align_still(
     """
     count = int((~scan.is_test).sum())
     require(count >= FEWEST, f"align needs {FEWEST} training frames at least, but there are {count}.")
-    frames = torch.from_numpy(scan.frames)
-    scan = replace(scan, frames=Light.of(frames, light).evened(frames).numpy())
+    scan = in_even_light(scan, light)
     material = assumed_material(scan.train(), prior, on_progress)
     upper = 1.0 if isinstance(prior, Known) else None
     words, held = list[str](), 0.0
@@ -302,15 +302,15 @@ class Judged:
     @classmethod
     def of(cls, scan: Scan, exposures: Exposures, search: PoseSearch, pixels: int) -> Judged:
         """On pixels `pixels` times larger; the same for all exposures that are compared."""
-        scan = Scan(scan.frames, exposures, scan.is_test).binned(pixels)
-        frames, train, options = torch.from_numpy(scan.frames), np.flatnonzero(~scan.is_test), search.options
+        scan = scan.taken(exposures).binned(pixels)
+        frames, train, options = scan.measured, np.flatnonzero(~scan.is_test), search.options
         lines = search.thickness(scan, scan.exposures) / scan.views.pitch
         views = in_pixels(scan.views)
         grid = Grid.of_views(views)
         solver = PrimalDual(LatticeProjector(grid, views[train]), torch.zeros(grid.shape), options.weight, search.upper)
-        solver.run(lines, 2 * options.first)
+        solver.run(lines, 2 * options.first, scan[train].gaps)
         images = predicted(solver.volume, grid, scan.exposures, search.material, fringe_sampling(scan.exposures)).frames
-        left = (frames - images) / frames.std(dim=(1, 2), keepdim=True).clamp_min(1e-12)
+        left = unexplained(frames, images)
         return cls(left.double().square().mean((1, 2)).sqrt().numpy(), mirrored(frames, images), left)
 
 

@@ -37,7 +37,7 @@ def rows_beyond(volume: Tensor, scan: Scan, ratio: float) -> int:
     absorption alone, which is seen where it is. Else the fringes' reach with the blur, and `ROOM`.
     """
     exposures, frames = scan.exposures, torch.from_numpy(scan.frames).double()
-    noise = 2 * float(noise_levels(frames).square().mean())
+    noise = 2 * float(noise_levels(scan.measured).square().mean())
     slopes = frames.diff(dim=2).square().mean(dim=(0, 2)) - noise
     chance = noise * math.sqrt(3 / (OUTER * len(frames) * frames.shape[2]))  # 3: neighbouring slopes share a pixel
     for rows, part, doubt in ((volume.mean(dim=(0, 2)), LEAVING, 0.0), (slopes, FINE, SURE * chance)):

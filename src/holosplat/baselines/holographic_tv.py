@@ -172,7 +172,7 @@ def _holographic_tv(
     wanted: Wanted,
     lines: Tensor | None,
 ) -> tuple[Tensor, Grid]:
-    noise = noise_share(torch.from_numpy(scan.frames))
+    noise = noise_share(scan.measured)
     scan, refine, factor = _working_resolution(scan, options)
     light = light if light is None or factor == 1 else light.part(torch.arange(len(scan)), factor)
     if light is None or light.background is None or options.still_light:  # still light is an unknown of tomography
@@ -246,6 +246,7 @@ def _settled(
     """
     assert light.background is not None
     measured = (torch.from_numpy(scan.frames) * light.factor()).float()
+    known = scan.known(measured)
     samples = fringe_sampling(scan.exposures)
     instrument = Instrument(scan.exposures, samples, backend=options.backend)
     best, least, first = None, float("inf"), light.noise
@@ -254,11 +255,11 @@ def _settled(
         solver = _tomography(scan, material, options, on_progress, light)
         lines = refined(solver.lines(), samples) * scan.views.finest
         predicted = frames_of(instrument, lines, material).detach().cpu()
-        after = light.settled(measured, predicted)
-        misfit = replace(after, noise=first).misfit(measured, predicted)
+        after = light.settled(known, predicted)
+        misfit = replace(after, noise=first).misfit(known, predicted)
         if best is not None and misfit >= least:
             break
-        noise = NoiseModel.of_residuals(after.evened(measured), predicted)
+        noise = NoiseModel.of_residuals(after.evened(known), predicted)
         best, least, light = (scan, light, solver), misfit, replace(after, noise=noise)
     assert best is not None
     return best

@@ -130,9 +130,9 @@ def level_of(occupancy: Tensor) -> float:
 
 def _trial_volume(scan: Scan, ratio: float, backend: Backend, options: MaterialEstimate, sign: float) -> Tensor:
     """Occupancy by Paganin's retrieval and a little total variation, not negative and without an upper bound."""
-    lines = paganin(torch.from_numpy(scan.frames), scan.exposures, sign * TRIAL_DELTA, sign * TRIAL_DELTA / ratio)
-    used = resolve(backend)
-    rays = rays_of(lines, scan.views, Grid.of_views(scan.views), used)
+    frames, delta, used = torch.from_numpy(scan.frames), sign * TRIAL_DELTA, resolve(backend)
+    lines = paganin(frames, scan.exposures, delta, delta / ratio, missing=scan.gaps)
+    rays = rays_of(lines, scan.views, Grid.of_views(scan.views), used, scan.gaps)
     how = TotalVariation(weight=options.weight, first=options.iterations, iterations=0)
     with memory_kept():
         return tv_solver(rays, None, how, lambda fraction: None, used).volume.cpu()

@@ -134,11 +134,16 @@ class PrimalDual:
             return images.new_zeros(images.shape[1:])
         return self._still.of(images - self.lines())
 
-    def run(self, images: Tensor, iterations: int) -> None:
-        """`iterations` more steps towards the volume that explains the line integrals [V, H, W]."""
+    def completed(self, images: Tensor, gaps: Tensor | None) -> Tensor:
+        """Line integrals [V, H, W], in the `gaps` [V, H, W] bool those of the volume."""
+        return images if gaps is None else torch.where(gaps, self.lines(), images)
+
+    def run(self, images: Tensor, iterations: int, gaps: Tensor | None = None) -> None:
+        """`iterations` more steps towards the volume that explains the line integrals [V, H, W], of which those in
+        the `gaps` have no weight."""
         lines = self.projector.lines_in(images)
         for _ in range(iterations):
-            self._iterate(lines)
+            self._iterate(lines if gaps is None else self.projector.lines_in(self.completed(images, gaps)))
 
     def _iterate(self, lines: Tensor) -> None:
         difference = self.projector.project(self._extrapolated) - lines

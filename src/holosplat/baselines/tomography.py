@@ -126,8 +126,7 @@ def tv_solver(
     gaps, measured = rays.gaps(), images
     for done in range(total):
         on_progress(done / total)
-        if gaps is not None:
-            images = torch.where(gaps, solver.lines(), measured)
+        images = solver.completed(measured, gaps)
         if done == options.first and options.discount > 0 and not alike:
             solver.discount(misfit_spectrum(rays, solver.lines() - images) ** options.discount)
         if done == options.first and options.misfit > 0:

@@ -49,7 +49,7 @@ class Shadows:
         exposures, views, pitch = scan.exposures, scan.views, scan.views.pixel_size
         frames = torch.from_numpy(scan.frames)
         how = Tikhonov(prior=FIXED)  # bodies are cut by the frames' edges
-        thickness = tikhonov(frames, exposures, *material, options=how).double() / pitch
+        thickness = tikhonov(frames, exposures, *material, options=how, missing=scan.gaps).double() / pitch
         noise = noise_level(thickness.float())
         if np.ptp(exposures.time) == 0:  # a search of several times found fewer bodies so (docs/notebook/motion.md)
             thickness = _without_halos(thickness, exposures, noise)
@@ -61,7 +61,7 @@ class Shadows:
             2 * (exposures.time - first) / (last - first) - 1,
             noise,
             wavelength(exposures.energy_kev) * exposures.distance / pitch**2,
-            per_pixel / max(float(noise_levels(frames).mean()), QUIETEST),
+            per_pixel / max(float(noise_levels(scan.measured).mean()), QUIETEST),
         )
 
     def __len__(self) -> int:

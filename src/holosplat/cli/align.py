@@ -137,14 +137,16 @@ def align(
         tell_frames("align", measured.exposures, out, lambda seen: of_alignment(seen, how))
     measured = measured.in_memory()
     prior = matter.prior(measured.exposures.reference_energy)
-    errors, frames, lasting = None, measured.source, np.arange(len(measured))
+    errors, frames, missing, lasting = None, measured.source, measured.missing, np.arange(len(measured))
     if axis_only:
         lines, exposures = _axis(measured, prior, illumination.options())
     else:
         found = _views(measured, prior, how, illumination.options())
         lines, exposures, errors = found.lines(), found.exposures, found.errors
         if isinstance(found, AlignedBeams):
-            frames = found.upright(measured.frames) if any(found.sides) else frames
+            if any(found.sides):
+                frames = found.upright(measured.frames)
+                missing = None if missing is None else found.upright(missing)
             lasting = lasting if geometry_out is None else found.lasting()
         if table is not None:
             _write_table(table, found)
@@ -155,7 +157,6 @@ def align(
         _write_geometry(geometry_out, scan, reading, (measured.exposures[lasting], exposures[lasting]), told, lines[0])
     facts = measured.provenance | {"aligned": lines[0]}
     light = measured.light if frames is measured.source else None  # that of frames which were turned back is not known
-    missing = measured.missing if frames is measured.source else None
     write_scan(out, Scan.of(frames, exposures, measured.is_test, facts, light, missing))
     print(f"wrote {out}: the same {len(measured)} frames, with other exposures", file=sys.stderr)
 

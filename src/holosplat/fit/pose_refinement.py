@@ -135,7 +135,7 @@ def with_pose_refinement(plan: Plan, freedom: PoseRefinement | None, train: Scan
     on = model.instrument.device
     alignment = freedom.alignment(on)
     (h, w), frames = exposures.views.shape, torch.from_numpy(train.frames)
-    level = max(ROUNDED * float(noise_levels(frames).mean() / (frames.max() - frames.min())), LEAST_LEFT)
+    level = max(ROUNDED * float(noise_levels(train.measured).mean() / (frames.max() - frames.min())), LEAST_LEFT)
     own = {
         "alignment.shifts": RATE_PX,
         "alignment.turns": RATE_PX / (0.5 * max(h, w)),

@@ -194,13 +194,6 @@ def tell_views(scan: Scan) -> None:
             f"the angles of {len(views)} frames span {wide:.4g} degrees only; if they are radians, say so in their "
             "unit, or in the first line of the file of --angles"
         )
-    if is_half_acquisition(scan):
-        width, off = views.shape[1], float(views.shifts[0, 0]) / views.pixel_size
-        warn(
-            f"the axis is at column {0.5 * (width - 1) - off:.4g} of {width}, far from the middle: a turn sweeps "
-            f"{width + 2 * abs(off):.0f} pixels, but the volume is as wide as a frame, and matter beyond it is cut "
-            "off; frames are joined to wider ones only where each has an opposite one"
-        )
 
 
 def is_half_acquisition(scan: Scan) -> bool:

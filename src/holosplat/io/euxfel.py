@@ -17,9 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import InputError, MissingError, UnsaidError, as_written, finite, positive, require, warn
-from ..frames import Frames
-from ..preprocess.flat_field import mean_frame, relative_intensity, unlit
+from ..checks import InputError, MissingError, UnsaidError, as_written, positive, require, warn
+from ..frames import Derived, Taken
+from ..preprocess.flat_field import mean_frame, relative_intensity
+from ..preprocess.pixels import filled, lit
 from ..scan import Exposures, Scan
 from .hdf5 import open_hdf5
 from .loader import Loader
@@ -28,7 +29,7 @@ from .reading import marked
 
 FILES = re.compile(r"(RAW|CORR|PROC)-R\d+-\w+-S\d+\.h5$")
 SOURCES = "*HPVX2*"
-PIXELS = "data.image.pixels"
+PIXELS, MASK = "data.image.pixels", "data.image.mask"
 RUN = "a run of the European XFEL"
 TRAIN_INTERVAL_S = 0.1
 """Trains come ten times a second, and are numbered one by one (Decking et al. 2020, Nature Photonics 14, 391)."""
@@ -38,44 +39,59 @@ TRAIN_INTERVAL_S = 0.1
 class KeyStack:
     """The frames [n, H, W] of one camera of a run, those of a train one after another.
 
-    places: train's identity and the pulse in it, of each frame.
+    places: train's identity and the pulse in it, of each frame; is_marked: whether masks of its pixels (`MASK`) are
+    there, too.
     """
 
     path: Path
     source: str
     places: tuple[tuple[int, int], ...]
     shape: tuple[int, int, int]
+    is_marked: bool = False
 
     def __getitem__(self, index: tuple[int, slice]) -> np.ndarray:
-        number, rows = index
+        return self._read(PIXELS, index[0])[index[1]]
+
+    def defective(self, number: int) -> np.ndarray:
+        """[H, W] bool: the pixels of a frame that the facility marks as defective."""
+        return self._read(MASK, number) != 0 if self.is_marked else np.zeros(self.shape[1:], dtype=bool)
+
+    def _read(self, name: str, number: int) -> np.ndarray:
         train, pulse = self.places[number]
         with as_written(self.path, RUN):
-            key = _run(str(self.path))[self.source, PIXELS]
+            key = _run(str(self.path))[self.source, name]
             single = len(key.entry_shape) == 2
             frame = key.select_trains(_by_id()[[train]]).ndarray(roi=() if single else (slice(pulse, pulse + 1),))
-            return frame.reshape(self.shape[1:])[rows]
+            return frame.reshape(self.shape[1:])
 
 
 @dataclass(frozen=True)
-class ModuleFrames(Frames):
+class ModuleFrames(Derived):
     """The frames of several cameras, each corrected by its own fields: frame t·M + m is that of camera m at time t.
 
     dark, light: [M, H, W] mean dark field, and mean flat field less that; light None where there are no flats.
+    mask: [M, H, W] bool, pixels without light. These, those that the facility marks, and values that are no numbers
+    are missing.
     """
 
     stacks: tuple[KeyStack, ...]
     dark: np.ndarray
     light: np.ndarray | None
+    mask: np.ndarray
     shape: tuple[int, int, int]
 
-    def read(self, numbers: np.ndarray) -> np.ndarray:
-        """See `Frames.read`."""
-        frames = np.empty((len(numbers), *self.shape[1:]), dtype=np.float32)
+    def with_missing(self, numbers: np.ndarray) -> Taken:
+        """See `Frames.with_missing`."""
+        frames, marked = (
+            np.empty((len(numbers), *self.shape[1:]), dtype=np.float32),
+            self.mask[numbers % len(self.mask)],
+        )
         for i, n in enumerate(numbers):
             time, camera = divmod(int(n), len(self.stacks))
             raw = self.stacks[camera][time, slice(0, self.shape[1])].astype(np.float64)
             frames[i] = raw if self.light is None else relative_intensity(raw, self.dark[camera], self.light[camera])
-        return finite(str(self.stacks[0].path), frames)
+            marked[i] |= self.stacks[camera].defective(time)
+        return filled(str(self.stacks[0].path), frames, ~np.isfinite(frames) & ~marked, marked, numbers)
 
 
 def read_euxfel(path: Path, given: Mapping[str, Any] = NOTHING) -> Scan:
@@ -89,10 +105,11 @@ def read_euxfel(path: Path, given: Mapping[str, Any] = NOTHING) -> Scan:
     dark = np.stack([_mean(camera, given, "darks") for camera in stacks])
     light = np.stack([_mean(camera, given, "flats") for camera in stacks]) - dark if given.get("flats") else None
     require(light is not None or not given.get("darks"), "--darks needs --flats, by which frames are divided.")
-    bad = 0 if light is None else int(unlit(light).sum())
-    require(bad == 0, f"flats must be brighter than darks everywhere, but in {bad} pixels they are not; use correct.")
     h, w = stacks[0].shape[1:]
-    frames = ModuleFrames(stacks, dark, light, (len(stacks) * stacks[0].shape[0], h, w))
+    mask = np.zeros((len(stacks), h, w), dtype=bool)
+    if light is not None:
+        light, mask = lit(str(path), light, mask)
+    frames = ModuleFrames(stacks, dark, light, mask, (len(stacks) * stacks[0].shape[0], h, w))
     exposures = exposures_of(str(path), given, {}, (h, w), np.ones(len(stacks), dtype=bool))
     exposures = exposures.repeated(_times(stacks[0], given))
     return Scan.of(frames, exposures, np.zeros(len(exposures), dtype=bool), _told(stacks))
@@ -117,7 +134,9 @@ def open_euxfel(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Iterato
     one = exposures_of(str(path), given, {}, shape, np.ones(1, dtype=bool))
     exposures: Exposures = one.repeated(_times(camera, given))
     label, held_out = f"{path}: {camera.source}", np.zeros(len(exposures), dtype=bool)
-    yield ScanFile(Path(path), label, joined, kinds, exposures, held_out, texts=_told(stacks), has_given_fields=True)
+    mask = np.logical_or.reduce([camera.defective(n) for n in range(camera.shape[0] if camera.is_marked else 1)])
+    facts = {"marked": mask, "texts": _told(stacks), "has_given_fields": True}
+    yield ScanFile(Path(path), label, joined, kinds, exposures, held_out, **facts)
 
 
 def _cameras(path: Path, given: Mapping[str, Any]) -> tuple[KeyStack, ...]:
@@ -148,7 +167,9 @@ def _stacks(path: Path, given: Mapping[str, Any]) -> tuple[KeyStack, ...]:
     count = 1 if len(entry[0]) == 2 else entry[0][0]
     pulses = np.flatnonzero(marked("--pulses", given.get("pulses") or ":", count))
     places = tuple((int(train), int(pulse)) for train in trains for pulse in pulses)
-    return tuple(KeyStack(path, name, places, (len(places), *entry[0][-2:])) for name in names)
+    shape = (len(places), *entry[0][-2:])
+    masks = [MASK in run.keys_for_source(name) and run[name, MASK].entry_shape == entry[0] for name in names]
+    return tuple(KeyStack(path, name, places, shape, has) for name, has in zip(names, masks))
 
 
 def _trains(path: Path, run: Any, names: list[str], wanted: str | None) -> np.ndarray:

@@ -11,14 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..checks import note
+from ..checks import note, warn
 from ..frames import Derived, Frames, Taken
 from ..preprocess.pixels import filled
 from ..scan import Scan
 from .angles import angles_of, is_half_acquisition
-
-NEAR = 0.5
-"""Pixels by which an opposite frame may show the outermost matter displaced."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +114,12 @@ def stitched(scan: Scan) -> Scan:
     first = np.flatnonzero((angles - angles[0] + 1e-6) % 360 < 180)
     away = np.abs((angles[first, None] + 180 - angles[None] + 180) % 360 - 180)
     pairs = np.stack([first, away.argmin(axis=1)], axis=1)
-    if math.radians(float(away.min(axis=1).max())) * raster.reach > NEAR:
+    if round(math.radians(float(away.min(axis=1).max())) * raster.reach) > 0:  # whole pixels, of the outermost matter
+        warn(
+            f"the axis is at column {raster.axis:.4g} of {raster.width}, far from the middle: a turn sweeps "
+            f"{2 * raster.reach:.0f} pixels, but the volume is as wide as a frame, and matter beyond it is cut off; "
+            "frames are joined to wider ones only where each has an opposite one"
+        )
         return scan
     frames = Stitched(scan.source, None if isinstance(scan.source, Frames) else scan.missing, pairs, raster)
     columns, exposures = raster.columns, scan.exposures[first]

@@ -13,8 +13,8 @@ import numpy as np
 
 from ..checks import InputError, note, require
 from ..frames import Derived, Frames, Taken
-from ..preprocess.flat_field import relative_intensity, unlit
-from ..preprocess.pixels import FILLED, MOST_DEFECTS, filled
+from ..preprocess.flat_field import relative_intensity
+from ..preprocess.pixels import FILLED, MOST_DEFECTS, filled, lit
 from ..scan import Scan
 from .hdf5 import open_hdf5
 from .kept_frames import with_fields
@@ -71,11 +71,13 @@ class StoredFrames(Derived):
             f"{file.label}: its pixel_mask marks {mask.mean():.0%} of the pixels as defective; 0 must stand for good "
             "ones.",
         )
-        dark, light = _fields_of_light(file, mask)
-        stacks = tuple(_Place.of(stack) if isinstance(stack, h5py.Dataset) else stack for stack in file.stacks)
-        whole = (len(numbers), *file.exposures.views.shape)
+        dark, light = _fields_of_light(file)
         if mask.any():
             note(f"{file.label}: the {int(mask.sum())} pixels that the file marks as defective {FILLED}")
+        if light is not None:
+            light, mask = lit(file.label, light, mask)
+        stacks = tuple(_Place.of(stack) if isinstance(stack, h5py.Dataset) else stack for stack in file.stacks)
+        whole = (len(numbers), *file.exposures.views.shape)
         places = [place for stack in file.stacks for place in _places_of(stack, path)]
         held = tuple((places[n], _stamp(places[n])) for n in numbers)
         return cls(path, file.label, stacks, file.flips, numbers, dark, light, mask, whole, held)
@@ -145,20 +147,10 @@ def _stamp(path: Path) -> tuple[int, ...]:
     return found.st_mtime_ns, found.st_size, found.st_ino
 
 
-def _fields_of_light(file: ScanFile, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """The mean dark field [H, W], and the mean flat field less that, None where the file has no flats; 1 in pixels of
-    the `mask` [H, W]."""
+def _fields_of_light(file: ScanFile) -> tuple[np.ndarray, np.ndarray | None]:
+    """The mean dark field [H, W], and the mean flat field less that, None where the file has no flats."""
     flats, darks = file.numbers(FLAT), file.numbers(DARK)
     if len(darks) and not len(flats):
         raise InputError(f"{file.kinds_label} must mark flats (1) beside the dark ones (2), but it marks none.")
     dark = file.mean(DARK)
-    if not len(flats):
-        return dark, None
-    light = np.where(mask, 1.0, file.mean(FLAT) - dark)
-    bad = int(unlit(light).sum())
-    require(
-        bad == 0,
-        f"{file.label} must have flat frames brighter than dark ones everywhere, but in {bad} of {light.size} pixels "
-        "they are not; `holosplat correct` repairs such pixels.",
-    )
-    return dark, light
+    return dark, file.mean(FLAT) - dark if len(flats) else None

@@ -5,9 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ..baselines.wave_frames import frames_of, refined
 from ..matter import DeltaBeta
+from ..model import Instrument
+from ..optics.noise import noise_levels
 from ..optics.retrieval import FIXED, Tikhonov, tikhonov
-from ..scan import Exposures
+from ..optics.sampling import fringe_sampling
+from ..scan import Exposures, Scan
 from .network import THICKNESS
 
 RETRIEVAL = Tikhonov(iterations=20, prior=FIXED)
@@ -21,6 +25,22 @@ def retrieved_thickness(frames: Tensor, exposures: Exposures, material: DeltaBet
     """Projected thickness [V, H, W] [m] of `material` in relative frames [V, H, W], each by itself; errors: those of
     `tikhonov`."""
     return tikhonov(frames, exposures, *material, options=RETRIEVAL)
+
+
+def seen_in(scan: Scan, material: DeltaBeta) -> tuple[Tensor, Tensor, Tensor]:
+    """The contrast [V, H, W] of a scan, the retrieved thickness of `material` [V, H, W] [smallest pixels], and the
+    noise [V].
+
+    Missing pixels have no weight: they show the contrast that the retrieved thickness has there.
+    """
+    frames, optics = torch.from_numpy(scan.frames), scan.exposures.optical
+    thickness = tikhonov(frames, scan.exposures, *material, options=RETRIEVAL, missing=scan.gaps)
+    if scan.gaps is not None:
+        samples = fringe_sampling(optics)
+        frames = torch.where(
+            scan.gaps, frames_of(Instrument(optics, samples), refined(thickness.float(), samples), material), frames
+        )
+    return frames - 1, thickness / scan.views.finest, noise_levels(scan.measured)
 
 
 def images(contrast: Tensor, thickness: Tensor, noise: Tensor) -> Tensor:

@@ -14,12 +14,11 @@ from torch.nn.functional import avg_pool2d, pad
 
 from ..geometry import Grid, Views
 from ..matter import DeltaBeta
-from ..optics.noise import noise_levels
 from ..progress import Progress
 from ..ranges import Natural, ranged
 from ..scan import Scan
 from ..volume import Volume
-from .images import images, retrieved_thickness
+from .images import images, seen_in
 from .lattice import COPIES, Taps
 from .network import FINE, Guess, coarse, thickness_of
 from .weights import Trained, read_weights
@@ -166,10 +165,10 @@ def _shown(scan: Scan, material: DeltaBeta) -> tuple[Tensor, Views, Grid]:
     Odd frames get a row or a column of air more. Of holes in a medium, contrast is shown with the opposite sign: that
     of bodies of the same shape, to first order, of which networks learn.
     """
-    frames, views = torch.from_numpy(scan.frames), scan.views
-    thickness = retrieved_thickness(frames, scan.exposures, material) / views.finest
+    contrast, thickness, noise = seen_in(scan, material)
+    views = scan.views
     (h, w), more = views.shape, [n % FINE for n in views.shape]
-    seen = images(material.sign * (frames - 1), thickness, noise_levels(frames))
+    seen = images(material.sign * contrast, thickness, noise)
     seen = pad(seen, (0, more[1], 0, more[0]))
     whole = views.cropped(slice(0, h + more[0]), slice(0, w + more[1]))
     large = replace(whole, shape=(seen.shape[2] // FINE, seen.shape[3] // FINE), pitch=FINE * views.pitch)

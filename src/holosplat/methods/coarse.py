@@ -233,7 +233,7 @@ def unexplained(mesh: SurfaceMesh, scan: Scan, surfaces: SurfaceOptions) -> floa
     measured = torch.from_numpy(scan.frames).double()
     mesh = mesh.on(resolve(surfaces.fit.backend))
     predicted = predicted_frames(scan.exposures, mesh, oversampling(scan, surfaces.fit)).double()
-    noise = 0.75 * float(noise_levels(measured).square().mean())  # one of four orthogonal patterns is left out
+    noise = 0.75 * float(noise_levels(scan.measured).square().mean())  # one of four orthogonal patterns is left out
     seen, left = (float(_finest(frames).square().mean()) - noise for frames in (measured, measured - predicted))
     return 0.0 if seen <= DOUBT * noise else max(left - DOUBT * noise, 0.0) / seen
 

@@ -49,9 +49,10 @@ class MissingMatter:
         self.scan = scan
         self.measured = torch.from_numpy(scan.frames)
         self._correction = Correction(scan, material)
-        self.whole = self.of(self.measured - 1)
+        even = scan.left(torch.ones(()))
+        self.whole = self.of(even)
         """Mean square of all matter in the frames [m²]."""
-        self.contrast = max(float((self.measured - 1).double().square().mean()), np.finfo(float).tiny)
+        self.contrast = max(float(even.double().square().mean()), np.finfo(float).tiny)
         """Mean square of their contrast."""
 
     def predicted(self, obj: Object, oversample: int = 0) -> Tensor:

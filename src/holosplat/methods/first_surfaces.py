@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-import torch
 from torch import Tensor
 
 from ..baselines import holographic_tv
@@ -105,4 +104,4 @@ def _of_volume(task: Task, options: GaussianOptions, surfaces: SurfaceOptions) -
 
 def is_noisy(task: Task, options: GaussianOptions) -> bool:
     """Whether the frames of `task` are too noisy to make a volume agree with them."""
-    return noise_share(torch.from_numpy(task.scan.frames)) > options.volume.noisy
+    return noise_share(task.scan.measured) > options.volume.noisy

@@ -88,7 +88,7 @@ class Folds:
         if self.by == BY_FISSION:
             frames = torch.from_numpy(self.scan.frames)
             draw = torch.randn(frames.shape, generator=torch.Generator().manual_seed(0))
-            noise = noise_levels(frames)[:, None, None].float() * draw
+            noise = noise_levels(self.scan.measured)[:, None, None].float() * draw
             return tuple(replace(self.scan, frames=(frames + s * noise).numpy()) for s in (1, -1))  # type: ignore[return-value]
         return self.scan[self.kept(fold)], self.scan[self.aside(fold)]
 

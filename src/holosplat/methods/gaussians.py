@@ -248,6 +248,6 @@ def _object_terms(base: Ground, options: FitOptions, grid: Grid, matter: Matter)
         terms.append(Anisotropy(w.anisotropy, w.anisotropy_limit))
     if w.uses_volume:
         block = grid.block((0, 0, 0), block_shape(grid, options.schedule))
-        noise = noise_share(torch.from_numpy(base.train.frames))
+        noise = noise_share(base.train.measured)
         terms.append(VolumeTerm(w, block, grid.shape[0], len(base.train), noise, matter.occupancies))
     return terms

@@ -95,7 +95,7 @@ def prepared(task: Task, method: Method | None = None, before: Prepared | None =
     else:
         signs = tuple(each for each in before[1] if each.name == SIGN)
     task = replace(task, prior=with_sign(task.prior, signs), decisions=(*task.decisions, *signs))
-    frames, options, handed = torch.from_numpy(task.scan.frames), task.light, task.scan.light
+    frames, options, handed = task.scan.measured, task.light, task.scan.light
     if handed is not None and options.kind != "even":
         return replace(task, lit=Light.handed(frames, options, handed))
     light = plain_light(frames, options)

@@ -113,7 +113,7 @@ class Task:
     @property
     def noise(self) -> NoiseModel:
         """The noise of the frames; what is not known of uneven light counts as such."""
-        found = self.lit or Light.of(torch.from_numpy(self.scan.frames), self.light)
+        found = self.lit or Light.of(self.scan.measured, self.light)
         return found.doubt
 
     @property

@@ -23,10 +23,9 @@ from ..fit.schedule import Schedule
 from ..fit.terms import Objective
 from ..fit.terms.field import AlignedFrames, AlignedLines
 from ..geometry import Grid
-from ..learning.images import images, retrieved_thickness
+from ..learning.images import images, seen_in
 from ..learning.weights import ONIX, PIXELNERF, read_aligned
 from ..matter import DeltaBeta, Matter
-from ..optics.noise import noise_levels
 from ..ranges import Natural, Rate, Share, Weight, ranged
 from ..representations import AlignedNetwork, PixelAligned, PixelAlignedField, Stored
 from ..representations.neural_field import grown
@@ -179,9 +178,8 @@ class AlignedStage:
 
 def seen_of(scan: Scan, material: DeltaBeta) -> tuple[Tensor, Tensor]:
     """The network's images [V, 3, H, W] of a scan, and the thickness of `material` [V, H, W] [pixels] in them."""
-    frames = torch.from_numpy(scan.frames)
-    thickness = (retrieved_thickness(frames, scan.exposures, material) / scan.views.finest).float()
-    return images(frames - 1, thickness, noise_levels(frames)), thickness
+    contrast, thickness, noise = seen_in(scan, material)
+    return images(contrast, thickness.float(), noise), thickness.float()
 
 
 def aligned_fit(task: Task, start: PixelAlignedField, options: AlignedFit, waves: bool) -> Fit:

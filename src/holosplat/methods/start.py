@@ -113,7 +113,7 @@ def _shares(
 
 def _spacing_px(scan: Scan, options: GaussianOptions) -> float:
     """Distance between Gaussians [pixels]: few large ones follow the noise less than many small ones."""
-    return options.spacing_px * min(2.0, 1 + options.spacing_noise * noise_share(torch.from_numpy(scan.frames)))
+    return options.spacing_px * min(2.0, 1 + options.spacing_noise * noise_share(scan.measured))
 
 
 def _random(task: Task, options: GaussianOptions) -> GaussianCloud:

@@ -211,7 +211,7 @@ def oversampling(scan: Scan, options: SurfaceFit = SurfaceFit()) -> int:
 def _bending(train: Scan, start: SurfaceMesh, objective: Objective) -> list[Term]:
     if objective.bending == 0:
         return []
-    frames = torch.from_numpy(train.frames)
+    frames = train.measured
     weight = objective.bending * (1 + objective.noise_gain * noise_share(frames)) / frames[0].numel()
     count = len(start.vertices)
     away = csr_array(eye_array(count) - neighbour_mean(start.faces.cpu().numpy(), count))

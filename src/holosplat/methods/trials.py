@@ -68,7 +68,7 @@ class Trial:
     @property
     def measured(self) -> Tensor:
         """The unseen frames [V, H, W]."""
-        return torch.from_numpy(self.unseen.frames)
+        return self.unseen.measured
 
     @cached_property
     def predicted(self) -> Tensor:
@@ -109,9 +109,9 @@ class Trials:
         if light is None:
             return False
         change = (light.factor() / before.light.factor() - 1).square().mean()
-        left = before.light.evened(torch.from_numpy(before.seen.frames)) - before.predicted
+        left = before.light.evened(before.seen.measured) - before.predicted
         power = float(change) + max(light.noise.grain_level**2 - before.light.noise.grain_level**2, 0.0)
-        return power > MARGIN**2 * float(left.double().square().mean())
+        return power > MARGIN**2 * float(left.double().square().nanmean())
 
     def score(self, name: str, fold: int) -> Score:
         """That of a hypothesis by its name, or of one of its `rivals`."""
@@ -131,7 +131,7 @@ class Trials:
 
     def _found(self, hypothesis: Hypothesis, fold: int) -> Light | None:
         if not hypothesis:
-            frames = torch.from_numpy(self._first.folds.split(fold)[0].frames)
+            frames = self._first.folds.split(fold)[0].measured
             return plain_light(frames, self._options)
         before = self.tried(hypothesis[:-1], fold)
         return with_more(before.light, hypothesis[-1], before.seen, before.predicted, self._options)
@@ -168,7 +168,7 @@ def with_more(light: Light, hypothesis: str, seen: Scan, predicted: Tensor, opti
     """`light` and what a hypothesis adds to it, by frames and their prediction [V, H, W] in even light; None where it
     cannot be: a pattern of one frame, or light where none shows air. Smooth light is that of coarse pixels, on which it
     is compared: on finer ones, what passes for air may be matter."""
-    frames = torch.from_numpy(seen.frames)
+    frames = seen.measured
     if hypothesis == "fixed pattern":
         return replace(light, still=fixed_pattern(light.evened(frames), predicted)) if len(seen) > 1 else None
     if hypothesis == "correlated noise":
@@ -179,7 +179,7 @@ def with_more(light: Light, hypothesis: str, seen: Scan, predicted: Tensor, opti
     frames, factor = frames if light.still is None else (frames / light.still).float(), coarse_binning(seen)
     smooth = replace(binned_options(options, seen.views.shape, factor), kind="smooth")
     try:
-        found = Light.of(torch.from_numpy(replace(seen, frames=frames.numpy()).binned(factor).frames), smooth)
+        found = Light.of(replace(seen, frames=frames.numpy()).binned(factor).measured, smooth)
     except InputError:  # no frame shows air
         return None
     return replace(finer_light(found, frames, factor), still=light.still)

@@ -114,7 +114,7 @@ class SmoothStage:
         scan = _beside(task, start).binned(factor)
         light = task.uneven and task.uneven.part(torch.arange(len(scan)), factor)
         if rows_of(start.grid, scan.views):
-            least = LEFT * contrast_level(torch.from_numpy(scan.frames))
+            least = LEFT * contrast_level(scan.measured)
             noise, light = noise.at_least(least), light and replace(light, noise=light.noise.at_least(least))
         how = (options.prior, options.coarser, options.rounds, options.iterations, options.faint, options.loose)
         # one density as a level lost 4 % of the total of balls at 500 photons a pixel, and gained nothing
@@ -127,9 +127,9 @@ def _beside(task: Task, start: VoxelGrid) -> Scan:
     if task.uneven is None or task.uneven.background is None:
         return task.scan
     light, measured = task.uneven, (torch.from_numpy(task.scan.frames) * task.uneven.factor()).float()
-    predicted = predicted_frames(task.scan.exposures, start)
-    after = light.settled(measured, predicted)
-    better = after.misfit(measured, predicted) < light.misfit(measured, predicted)
+    predicted, known = predicted_frames(task.scan.exposures, start), task.scan.known(measured)
+    after = light.settled(known, predicted)
+    better = after.misfit(known, predicted) < light.misfit(known, predicted)
     return replace(task.scan, frames=after.evened(measured).numpy()) if better else task.scan
 
 

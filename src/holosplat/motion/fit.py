@@ -113,7 +113,7 @@ def motion_fit(
 
 
 def _terms(base: Ground, start: MovingSurfaces, options: MotionFit) -> list[Term]:
-    frames, wanted, times = torch.from_numpy(base.train.frames), options.objective, base.train.instants
+    frames, wanted, times = base.train.measured, options.objective, base.train.instants
     found: list[Term] = []
     if wanted.bending > 0:
         weight = wanted.bending * (1 + wanted.noise_gain * noise_share(frames)) / frames[0].numel()

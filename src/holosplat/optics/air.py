@@ -55,7 +55,8 @@ def find_air(frames: Tensor) -> Tensor:
     Air is quiet: the power between two scales of blur is that of the frame's quietest parts. It reaches the left or
     the right border, where the inside of a smooth body does not, and it is about as bright as the frame is anywhere.
     The frames need not be normalised, and the light may change slowly across them. Frames of fewer than `FEWEST` rows
-    or columns, or of fewer than `SMALLEST_FRAME` pixels, have none.
+    or columns, or of fewer than `SMALLEST_FRAME` pixels, have none. Pixels that are NaN have no value: they have no
+    weight, and are no air.
     """
     return torch.from_numpy(np.stack([_air(frame) for frame in frames.detach().cpu().double().numpy()]))
 
@@ -81,26 +82,39 @@ def has_air(air: Tensor) -> Tensor:
 
 
 def _air(frame: np.ndarray) -> np.ndarray:
-    level = float(np.median(frame))
+    known = np.isfinite(frame)
+    if not known[:, [0, -1]].any(axis=0).all() and known.any():  # borders are those of what has a value
+        first, last = np.flatnonzero(known.any(axis=0))[[0, -1]]
+        return np.pad(_air(frame[:, first : last + 1]), ((0, 0), (first, frame.shape[1] - 1 - last)))
+    weights = {width: gaussian_filter(known.astype(float), width, mode="nearest") for width in (FINE, COARSE, WINDOW)}
+
+    def blurred(image: np.ndarray, width: float) -> np.ndarray:
+        if known.all():
+            return gaussian_filter(image, width, mode="nearest")
+        sums = gaussian_filter(np.where(known, image, 0.0), width, mode="nearest")
+        return sums / np.maximum(weights[width], np.finfo(float).tiny)
+
+    level = float(np.median(frame[known])) if known.any() else 0.0
     if min(frame.shape) < FEWEST or frame.size < SMALLEST_FRAME or level <= 0:
         return np.zeros(frame.shape, dtype=bool)
-    power = (gaussian_filter(frame, FINE, mode="nearest") - gaussian_filter(frame, COARSE, mode="nearest")) ** 2
-    smooth = gaussian_filter(frame, WINDOW, mode="nearest")
-    bright = smooth >= DARKER * min(np.quantile(smooth, BRIGHT), np.quantile(smooth[:, [0, -1]], BRIGHT_BESIDE))
-    unbound = gaussian_filter(power, WINDOW, mode="nearest")
-    limit = float(np.quantile(unbound[bright], QUIET))
-    noise = max(limit / QUIET_POWER, ROUNDED * float(power.max()))
+    power = (blurred(frame, FINE) - blurred(frame, COARSE)) ** 2
+    smooth, sides = blurred(frame, WINDOW), known[:, [0, -1]]
+    beside = np.quantile(smooth[:, [0, -1]][sides], BRIGHT_BESIDE)
+    bright = ~known | (smooth >= DARKER * min(np.quantile(smooth[known], BRIGHT), beside))
+    unbound = blurred(power, WINDOW)
+    limit = float(np.quantile(unbound[bright & known], QUIET))
+    noise = max(limit / QUIET_POWER, ROUNDED * float(power[known].max()))
     found = np.zeros(frame.shape, dtype=bool)
     quiet = _finest(frame / level)[(unbound <= limit)[:-1, :-1]]
-    fine = WHITE_POWER * float(quiet.mean()) if quiet.size else 0.0
-    if noise > max(NOISE_LIKE * fine, FAINT * float(power.mean())):
+    fine = WHITE_POWER * float(np.nanmean(quiet)) if np.isfinite(quiet).any() else 0.0
+    if noise > max(NOISE_LIKE * fine, FAINT * float(power[known].mean())):
         return found
-    activity = gaussian_filter(np.minimum(power, CAP * noise), WINDOW, mode="nearest")
+    activity = blurred(np.minimum(power, CAP * noise), WINDOW)
     fringes = np.asarray(binary_dilation(activity > ACTIVE * noise, iterations=MARGIN), dtype=bool)
     patches, count = cast(tuple[np.ndarray, int], label(bright & ~fringes))
-    sizes = np.bincount(patches.ravel(), minlength=count + 1) / frame.size
+    sizes = np.bincount(patches[known], minlength=count + 1) / frame.size
     beside = np.unique(patches[:, [0, -1]])
-    found = np.isin(patches, [n for n in beside if n > 0 and sizes[n] >= SMALLEST])
+    found = known & np.isin(patches, [n for n in beside if n > 0 and sizes[n] >= SMALLEST])
     return found if found.mean() >= LEAST_AIR else np.zeros_like(found)
 
 

@@ -69,10 +69,10 @@ class LightOptions:
         require(known, f"noise must be auto, white or correlated, but it is {self.noise!r}.")
 
     def air_of(self, frames: Tensor) -> Tensor:
-        """The air [V, H, W] bool of frames [V, H, W]."""
+        """The air [V, H, W] bool of frames [V, H, W]; pixels that are NaN, which have no value, are none."""
         if not self.air:
             return find_air(frames)
-        return air_in_boxes(self.air, len(frames), (frames.shape[-2], frames.shape[-1]))
+        return air_in_boxes(self.air, len(frames), (frames.shape[-2], frames.shape[-1])) & ~frames.isnan()
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,8 @@ class Light:
 
     @classmethod
     def of(cls, frames: Tensor, options: LightOptions = LightOptions()) -> Light:
-        """By frames [V, H, W]; errors: `InputError` for smooth light where no frame has air."""
+        """By frames [V, H, W], NaN in pixels without a value (`Scan.measured`); errors: `InputError` for smooth light
+        where no frame has air."""
         air = options.air_of(frames)
         noise = NoiseModel.of_frames(frames, air)
         background = _found(frames, noise, air, options.kind)
@@ -160,7 +161,7 @@ class Light:
     def misfit(self, frames: Tensor, predicted: Tensor) -> float:
         """χ² of measured frames [V, H, W] beside those predicted in even light, and of the light for its prior."""
         known = self.background
-        left = (frames - predicted * self.factor()).double().square().sum(dim=(1, 2)) / _lowest_power(self.noise)
+        left = (frames - predicted * self.factor()).double().square().nansum(dim=(1, 2)) / _lowest_power(self.noise)
         of_light = 0.0 if known is None else float((known.coefficients.square() / known.variances).sum())
         return float(left.sum()) + of_light
 
@@ -216,9 +217,10 @@ class Background:
         What they have in common, a volume takes for absorption: the mean flux is as unsure as V draws leave it.
         """
         shape, count = (frames.shape[-2], frames.shape[-1]), len(frames)
-        ratio = frames.double().mean(dim=(1, 2)) / predicted.double().mean(dim=(1, 2))
+        seen = torch.where(frames.isnan(), 0.0, predicted.double())
+        ratio = frames.double().nansum(dim=(1, 2)) / seen.sum(dim=(1, 2))
         rest = frames.double() / ratio[:, None, None] - predicted.double()
-        powers = rest.square().mean(dim=(1, 2)).clamp_min(FAINTEST**2)
+        powers = rest.square().nanmean(dim=(1, 2)).clamp_min(FAINTEST**2)
         flux = ratio.log() - ratio.log().mean()
         variance = max(0.0, float(flux.square().sum() / max(count - 1, 1) - powers.mean() / math.prod(shape)))
         level = torch.zeros((ORDER + 1) ** 2, dtype=torch.float64)
@@ -336,7 +338,7 @@ def _surely_uneven(frames: Tensor, air: Tensor, noise: NoiseModel, usable: Tenso
     squares = float(((found * right).sum(dim=1) / power.clamp_min(1e-30)).sum())
     freedom = float(right.numel())
     size = float((((found @ modes).reshape(lit.shape) * seen).square().sum() - len(modes) * power.sum()) / seen.sum())
-    contrast = float((lit - 1).square().mean())
+    contrast = float((lit - 1).square().nanmean())
     deviations = (squares - freedom) / (2 * freedom) ** 0.5
     return any(deviations > most and size > least**2 * contrast for most, least in ((UNEVEN, SEEN), (SURE, FAINT)))
 
@@ -382,7 +384,7 @@ def _lowest_power(noise: NoiseModel) -> Tensor:
 def _sums(values: Tensor, seen: Tensor, modes: Tensor) -> tuple[Tensor, Tensor]:
     """Of values [V, P], where they are seen [V, P], and modes [K, P]: their products [V, K, K] and [V, K]."""
     normal = torch.stack([(modes * one) @ modes.T for one in seen])
-    return normal, (values * seen) @ modes.T
+    return normal, (values.nan_to_num() * seen) @ modes.T
 
 
 def _posterior(normal: Tensor, right: Tensor, variances: Tensor, powers: Tensor) -> tuple[Tensor, Tensor]:

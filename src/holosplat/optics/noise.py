@@ -1,4 +1,4 @@
-"""How noisy frames are, by the frames alone."""
+"""How noisy frames are, by the frames alone; pixels that are NaN have no value, and no weight."""
 
 from __future__ import annotations
 
@@ -21,6 +21,11 @@ PHOTON_RANGE = (1e-3, 1e15)
 """Photons a pixel that noise can be simulated for."""
 
 
+def with_gaps(frames: Tensor, missing: Tensor | None) -> Tensor:
+    """Frames [V, H, W] that are NaN where they are `missing` [V, H, W] bool (None: nowhere)."""
+    return frames if missing is None else frames.masked_fill(missing.to(frames.device), torch.nan)
+
+
 def noise_level(images: Tensor) -> float:
     """Standard deviation of white noise on images [V, H, W].
 
@@ -32,8 +37,8 @@ def noise_level(images: Tensor) -> float:
     rows, columns = differences.shape[1:]
     h = min(TILE, rows)
     w = min(TILE if rows >= TILE // 2 else TILE**2 // h, columns)
-    tiles = differences.unfold(1, h, h).unfold(2, w, w).flatten(3).median(dim=-1).values
-    return float(tiles.flatten().quantile(QUIET)) / (norm * NORMAL_MEDIAN)
+    tiles = differences.unfold(1, h, h).unfold(2, w, w).flatten(3).nanmedian(dim=-1).values
+    return float(tiles.flatten().nanquantile(QUIET)) / (norm * NORMAL_MEDIAN)
 
 
 def _rough(images: Tensor) -> tuple[Tensor, float]:
@@ -55,9 +60,9 @@ def wavelet_noise(frames: Tensor) -> Tensor:
     i = frames.detach().double()
     if min(i.shape[1:]) < 2:
         differences, norm = _rough(i)
-        return differences.flatten(1).median(1).values / (norm * NORMAL_MEDIAN)
+        return differences.flatten(1).nanmedian(1).values / (norm * NORMAL_MEDIAN)
     diagonal = 0.5 * (i[:, :-1, :-1] + i[:, 1:, 1:] - i[:, :-1, 1:] - i[:, 1:, :-1])
-    return diagonal.abs().flatten(1).median(1).values / NORMAL_MEDIAN
+    return diagonal.abs().flatten(1).nanmedian(1).values / NORMAL_MEDIAN
 
 
 def noise_levels(frames: Tensor) -> Tensor:
@@ -86,5 +91,5 @@ def _of_quiet_tiles(frames: Tensor) -> Tensor:
 
 def noise_share(frames: Tensor) -> float:
     """Noise as a share of the contrast of relative frames [V, H, W]: 0 for frames without, about 1 for noise alone."""
-    contrast = float((frames.double() - 1).square().mean().sqrt())
+    contrast = float((frames.double() - 1).square().nanmean().sqrt())
     return min(1.0, float(noise_levels(frames).mean()) / contrast) if contrast > 0 else 0.0

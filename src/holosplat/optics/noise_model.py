@@ -85,9 +85,10 @@ class NoiseModel:
     def of_frames(cls, frames: Tensor, air: Tensor | None = None, correlated: bool = False) -> NoiseModel:
         """The noise of relative frames [V, H, W], by their air [V, H, W] bool, or by air that they show themselves.
 
-        The white noise is that of the highest frequencies in each frame's air; of a frame without air it is what both
-        estimates of `noise.sure_noise` agree on: fringes that fill a frame are not noise. correlated: whether what
-        correlates neighbours in air, beyond what slow light does (`DETREND`), is noise, too; else there is none such.
+        Pixels that are NaN have no value, and are no air. The white noise is that of the highest frequencies in each
+        frame's air; of a frame without air it is what both estimates of `noise.sure_noise` agree on: fringes that fill
+        a frame are not noise. correlated: whether what correlates neighbours in air, beyond what slow light does
+        (`DETREND`), is noise, too; else there is none such.
         """
         air = find_air(frames) if air is None else air
         usable = has_air(air)
@@ -95,7 +96,7 @@ class NoiseModel:
         white = torch.where(usable, torch.zeros(len(frames), dtype=torch.float64), sure_noise(frames))
         if not bool(usable.any()):
             return cls.white_only(white, shape)
-        rest = _without_light(frames[usable].double(), air[usable])
+        rest = _without_light(frames[usable].double().nan_to_num(), air[usable])
         white[usable] = _finest(rest, air[usable])
         if not correlated:
             return cls.white_only(white, shape)
@@ -103,11 +104,12 @@ class NoiseModel:
 
     @classmethod
     def of_residuals(cls, frames: Tensor, predicted: Tensor) -> NoiseModel:
-        """The noise, white and correlated, that frames [V, H, W] have beside those `predicted` by a first volume."""
+        """The noise, white and correlated, that frames [V, H, W] have beside those `predicted` by a first volume;
+        pixels that are NaN have no weight."""
         rest = frames.double() / predicted.double().clamp_min(DARKEST) - 1
-        everywhere = torch.ones(rest.shape, dtype=torch.bool)
-        white = _finest(rest, everywhere)
-        return cls(white, _grain(rest, everywhere, white)[None].expand(len(frames), -1, -1), frames.shape[-1])
+        known, rest = ~rest.isnan(), rest.nan_to_num()
+        white = _finest(rest, known)
+        return cls(white, _grain(rest, known, white)[None].expand(len(frames), -1, -1), frames.shape[-1])
 
     @property
     def shape(self) -> tuple[int, int]:

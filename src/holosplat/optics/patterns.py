@@ -38,14 +38,15 @@ DARKEST = 0.01
 
 def fixed_pattern(frames: Tensor, predicted: Tensor) -> Tensor:
     """The pattern [H, W], float64, by frames [V, H, W] over those `predicted`; one where frames have nothing in common.
+    Pixels that are NaN have no weight.
 
     The logarithms of frames over predictions are the pattern's and what each frame has alone. Products of different
     frames give the power of the former, and a Wiener filter of single pixels takes their mean for it as far as chance
     allows: `p = mean · c / (c + o / V)`, c the common power and o that of a frame alone.
     """
     left, count = _logarithms(frames) - _logarithms(predicted), len(frames)
-    left = left - left.mean()
-    total, mean = float(left.square().mean()), left.mean(dim=0)
+    left = left - left.nanmean()
+    total, mean = float(left.square().nanmean()), left.nanmean(dim=0).nan_to_num()
     chance = (total - float(mean.square().mean())) / max(count - 1, 1)  # of the mean: the power of a frame alone over V
     common = max(float(mean.square().mean()) - chance, 0.0)
     share = common / (common + chance) if count > 1 and common > 0 else 0.0
@@ -55,7 +56,7 @@ def fixed_pattern(frames: Tensor, predicted: Tensor) -> Tensor:
 def mean_light(frames: Tensor, predicted: Tensor, order: int) -> Tensor:
     """The geometric mean [H, W], float64, of frames [V, H, W] over those `predicted`: of up to `order` half waves, with
     its mean taken to be right, or any pattern (0)."""
-    mean = (_logarithms(frames) - _logarithms(predicted)).mean(dim=0)
+    mean = (_logarithms(frames) - _logarithms(predicted)).nanmean(dim=0).nan_to_num()
     if order:
         modes = smooth_modes((mean.shape[0], mean.shape[1]), order)[1:].flatten(1).double()
         mean = (torch.linalg.lstsq(modes.T, mean.flatten()[:, None]).solution[:, 0] @ modes).reshape(mean.shape)

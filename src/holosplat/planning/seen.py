@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import torch
-
 from ..methods import Method
 from ..methods.gaussians import Gaussians
 from ..methods.window import windows_of
@@ -31,7 +29,7 @@ def seen_of(scan: Scan, method: Method, whole: bool = False) -> Seen:
     if not can_be_seen(scan) or scan.is_series:
         return UNSEEN
     scan = scan.train().in_memory()
-    noise = NoiseModel.white_only(noise_levels(torch.from_numpy(scan.frames)), scan.views.shape)
+    noise = NoiseModel.white_only(noise_levels(scan.measured), scan.views.shape)
     windows = None if whole else windows_of(scan, noise)
     worked = scan if windows is None else windows.of(scan)
     return Seen(None if windows is None else Sizes.of(worked.exposures), _is_noisy(worked, method))
@@ -44,4 +42,4 @@ def _is_noisy(scan: Scan, method: Method) -> bool:
         return False
     factor = gaussians.coarse.factor(scan.views.shape)
     coarse = scan.binned(factor) if factor > 1 else scan
-    return noise_share(torch.from_numpy(coarse.frames)) > gaussians.volume.noisy
+    return noise_share(coarse.measured) > gaussians.volume.noisy

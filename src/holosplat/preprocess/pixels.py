@@ -8,6 +8,7 @@ from scipy.sparse import csr_array
 
 from ..checks import require, shaped, warn
 from ..frames import Taken
+from .flat_field import unlit
 
 NEIGHBOURHOOD = 5
 """Edge of the window that gives the usual level of a pixel."""
@@ -79,6 +80,23 @@ class PixelRepair:
                     entries += [1 / len(good)] * len(good)
                     break
         return csr_array((entries, (rows, columns)), shape=(len(self.places), h * w))
+
+
+def lit(label: str, light: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Flat fields less dark ones [..., H, W], 1 where they are not positive, and the `mask` [..., H, W] of defective
+    pixels with these.
+
+    A warning gives their number. Errors: `InputError` for more than a part `MOST_DEFECTS` of the pixels.
+    """
+    dim, none = unlit(light), unlit(light) & ~mask
+    require(
+        none.mean() <= MOST_DEFECTS,
+        f"{label} must have flats that are brighter than its darks, but in {none.mean():.0%} of the pixels they are "
+        "not; check which frames are flats and which are darks.",
+    )
+    if none.any():
+        warn(f"{label}: {int(none.sum())} pixels whose flats are not brighter than the darks {FILLED}")
+    return np.where(dim, 1.0, light), mask | dim
 
 
 def filled(label: str, frames: np.ndarray, found: np.ndarray, mask: np.ndarray, numbers: np.ndarray) -> Taken:

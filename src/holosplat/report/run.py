@@ -212,7 +212,7 @@ def _lit(reconstruction: Reconstruction, scan: Scan, evaluation: Evaluation) -> 
     chosen = train[evenly_chosen(len(train), MOST_LIT)]
     shown = scan[chosen]
     predicted = render(reconstruction, shown.exposures)
-    measured, part = torch.from_numpy(shown.frames), light.part(torch.from_numpy(chosen))
+    measured, part = shown.measured, light.part(torch.from_numpy(chosen))
     if part.background is not None:
         fixed = 1.0 if part.still is None else part.still
         part = replace(part, background=part.background.seen_beside(measured / fixed, torch.from_numpy(predicted)))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 from ..baselines import HolographicTV
 from ..checks import require
@@ -60,7 +59,7 @@ def estimate_fixed_pattern(
         upper=prior.bound(1.0),
     )
     predicted = predicted_first(train, prior, how, on_progress)
-    return mean_light(torch.from_numpy(train.frames), predicted, options.order).float().numpy()
+    return mean_light(train.measured, predicted, options.order).float().numpy()
 
 
 def flatfield_corrected(

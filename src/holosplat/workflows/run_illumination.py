@@ -48,7 +48,7 @@ def fixed_pattern_of(task: Task, method: Method, found: Stored, oversample: int)
     if not order:
         return None
     predicted = predicted_frames(task.scan.exposures, found, oversample)
-    return mean_light(torch.from_numpy(task.scan.frames), predicted, order).numpy().astype(np.float32)
+    return mean_light(task.scan.measured, predicted, order).numpy().astype(np.float32)
 
 
 def light_of(scan: Scan, assumed: LightOptions, still: np.ndarray | None = None) -> Light | None:
@@ -58,7 +58,7 @@ def light_of(scan: Scan, assumed: LightOptions, still: np.ndarray | None = None)
     frame's own. A frame without air has its prior mean, even light; so have all frames where none has air.
     still: [H, W], beside that: what the training frames of the run have in common, and frames of this raster with them.
     """
-    frames = torch.from_numpy(scan.frames)
+    frames = scan.measured
     common = None if still is None or still.shape != scan.views.shape else torch.from_numpy(still).double()
     if common is not None:
         frames = (frames / common).float()

@@ -135,7 +135,7 @@ def _held(found: Stored, frames: Scan) -> float:
 
 def _noise(task: Task, frames: Scan) -> NoiseModel:
     """The noise of the fitted frames: all that the task has, or what is left when some are set aside."""
-    return task.noise if len(frames) == len(task.scan) else NoiseModel.of_frames(torch.from_numpy(frames.frames))
+    return task.noise if len(frames) == len(task.scan) else NoiseModel.of_frames(frames.measured)
 
 
 def _imaged_as_voxels(said: Prediction, frames: Scan, factor: int) -> bool:

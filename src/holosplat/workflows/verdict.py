@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from ..align import find_axis
 from ..checks import InputError
 from ..fit.misfit_diagnosis import Cause, cause_scores, likely_causes
 from ..fit.residuals import Prediction, Residuals, residuals, split_validation
@@ -125,7 +126,7 @@ that are looked at."""
 def judge(said: Prediction, frames: Scan, noise: NoiseModel | None = None) -> Verdict:
     """The verdict on a prediction of `frames`, whose exposures the prediction has; noise: None to estimate it."""
     measured = torch.from_numpy(frames.frames)
-    left = residuals(said, measured, (noise or _noise(measured)).power(), missing=frames.gaps)
+    left = residuals(said, measured, (noise or _noise(frames.measured)).power(), missing=frames.gaps)
     found = verdict(left)
     absorbing, refracting = _matter(said)
     if not bool(absorbing.any() or refracting.any()):
@@ -173,7 +174,24 @@ def judge_run(found: Stored, fit: Running | None, task: Task, oversample: int) -
     Frames in uneven light are flat-field corrected; the uncertainty of the light counts as noise.
     """
     said, fitted = said_of_run(found, fit, task, oversample)
-    return judge(said, fitted, task.noise if task.uneven and said.light is None else None)
+    found = judge(said, fitted, task.noise if task.uneven and said.light is None else None)
+    return found if found.good else _about_another_axis(found, task.scan)
+
+
+def _about_another_axis(found: Verdict, frames: Scan) -> Verdict:
+    """The verdict with the axis of rotation as the likeliest cause, where projections tell for sure that it is
+    elsewhere: matter that was fitted about a wrong one has followed it, so that the residual does not show it."""
+    try:
+        offset = find_axis(frames).offset
+    except InputError:  # no common axis, or nothing to tell it by
+        return found
+    if frames.is_series or abs(offset.value) < LARGE["shift_x"] or not offset.compared("another axis").wins:
+        return found
+    reason = (
+        f"Likely cause: the axis of rotation is {abs(offset.value):.2g} ± {offset.error:.1g} px to the "
+        f"{'right' if offset.value > 0 else 'left'} of where the scan says: there the projections agree."
+    )
+    return replace(found, reasons=(reason, *found.reasons), cause="shift_x")
 
 
 def said_of_run(found: Stored, fit: Running | None, task: Task, oversample: int) -> tuple[Prediction, Scan]:

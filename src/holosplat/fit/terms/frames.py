@@ -52,7 +52,7 @@ class SpectralMisfit:
         self._amplitudes = torch.from_numpy(train.frames).clamp_min(0).sqrt().to(on)
         self._missing = None if train.gaps is None else train.gaps.to(on)
         response = linear_response(exposures, ratio) / torch.from_numpy(strongest)[:, None, None]
-        self.noise = noise_level(self._amplitudes) / float(unit.mean())
+        self.noise = noise_level(train.measured.clamp_min(0).sqrt()) / float(unit.mean())
         """Standard deviation of r that the noise of the measured frames gives [pixels of thickness]."""
         self.floor = floor + NOISE_FLOOR * self.noise
         """f, which noise has raised."""
@@ -119,12 +119,12 @@ class FrameTerm:
         self._missing = None if train.gaps is None else train.gaps.to(frames.device)
         if objective.ssim > 0:
             _ = self._target.statistics  # once, for all subsets of views
-        coarse = objective.coarse * min(1.0, noise_share(measured) / COARSEST_NOISE) if objective.coarse else 0.0
+        coarse = objective.coarse * min(1.0, noise_share(train.measured) / COARSEST_NOISE) if objective.coarse else 0.0
         self._blur = NarrowingBlur(frames.shape[1:], coarse, frames.device) if coarse > LEAST_BLUR else None
         if objective.noise_width > 0 or self._blur:
-            noise = photon_noise(measured)
+            noise = photon_noise(train.measured).nan_to_num()
             self._width = (objective.noise_width * noise).clamp_min(1e-6 * self.span).to(frames.device)
-        noise = float(noise_levels(measured).mean()) / self.span if objective.rounded > 0 else 0.0
+        noise = float(noise_levels(train.measured).mean()) / self.span if objective.rounded > 0 else 0.0
         self._rounding = max(SMALLEST_ROUNDING, objective.rounding * noise)
         self.spectral = SpectralMisfit(train, instrument, matter, objective.floor) if objective.spectral > 0 else None
         self.resolved = self._resolved(coarse if self._blur else 0.0)

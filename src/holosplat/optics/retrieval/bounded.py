@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from ...scan import Exposures
-from ..noise import wavelet_noise
+from ..noise import wavelet_noise, with_gaps
 from .spectra import Gaps, Noise, Prior, Raster, completed, filtered, response, spectra, surrounded
 
 STEPS = 25
@@ -65,10 +65,10 @@ def bounded_estimate(
     contrast, crop = surrounded(frames, exposures)
     raster = Raster((contrast.shape[-2], contrast.shape[-1]), exposures.views.pixel_size)
     h, prior = response(exposures, ratio, raster), prior or (FIXED if leaves else None)
-    known = spectra(frames, exposures, h, raster, noise, MODEL_ERROR, prior, leaks=prior is None)
+    known = spectra(frames, exposures, h, raster, noise, MODEL_ERROR, prior, leaks=prior is None, missing=missing)
     trusted = 1 - known.inverse * known.response
     if noise is None:
-        doubtful = wavelet_noise(frames) * known.inverse.square().mean(dim=(1, 2)).sqrt()
+        doubtful = wavelet_noise(with_gaps(frames, missing)) * known.inverse.square().mean(dim=(1, 2)).sqrt()
     else:
         doubtful = known.noise_of(known.inverse)
     least = (SIGNIFICANT * doubtful)[:, None, None]

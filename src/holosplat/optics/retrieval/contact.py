@@ -17,7 +17,7 @@ from torch import Tensor
 from ...checks import require
 from ...scan import Exposures
 from ...units import wavenumber
-from ..noise import noise_levels
+from ..noise import noise_levels, with_gaps
 from .spectra import checked, column, finest_phase
 
 UNSEEN = 0.01
@@ -37,7 +37,9 @@ def absorption_alone(exposures: Exposures, ratio: float) -> np.ndarray:
     return finest_phase(exposures) <= UNSEEN * np.abs(beta) / delta
 
 
-def contact_thickness(frames: Tensor, exposures: Exposures, delta: float, beta: float) -> Tensor:
+def contact_thickness(
+    frames: Tensor, exposures: Exposures, delta: float, beta: float, missing: Tensor | None = None
+) -> Tensor:
     """Thickness [V, H, W] in metres, `-ln I / 2kβ`, of matter with β ≠ 0 from frames [V, H, W] of absorption alone.
 
     Errors: `InputError` for matter that does not absorb.
@@ -48,7 +50,9 @@ def contact_thickness(frames: Tensor, exposures: Exposures, delta: float, beta: 
         "frames taken at a distance.",
     )
     mu = column(2 * wavenumber(exposures.energy_kev) * exposures.refraction(delta, beta)[1])
-    one_photon = noise_levels(frames)[:, None, None].square()  # variance σ² of relative frames: a photon counts σ²
+    one_photon = noise_levels(with_gaps(frames, missing))[
+        :, None, None
+    ].square()  # variance σ² of relative frames: a photon counts σ²
     least = one_photon.clamp_min(LEAST_INTENSITY).to(frames.device)
     return (-torch.log(torch.maximum(frames.double(), least)) / mu.to(frames.device)).to(frames.dtype)
 
@@ -72,7 +76,9 @@ def or_in_contact(method: Method) -> Method:
         if not alone.any():
             return method(frames, exposures, delta, beta, missing=missing, **options)
         found = torch.empty_like(frames)
-        found[alone] = contact_thickness(frames[alone], exposures[alone], delta, beta)
+        found[alone] = contact_thickness(
+            frames[alone], exposures[alone], delta, beta, missing if missing is None else missing[alone]
+        )
         if not alone.all():
             some = None if missing is None else missing[~alone]
             found[~alone] = method(frames[~alone], exposures[~alone], delta, beta, missing=some, **options)

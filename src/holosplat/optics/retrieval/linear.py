@@ -90,7 +90,7 @@ def paganin(
     raster = Raster((contrast.shape[-2], contrast.shape[-1]), exposures.views.pixel_size)
     ratio = absorption(exposures, beta / delta)
     h = 2 * (ratio + fresnel_phase(exposures, raster)) * detector_transfer(exposures, raster)
-    known = spectra(frames, exposures, h, raster, options.noise, options.model_error, options.prior)
+    known = spectra(frames, exposures, h, raster, options.noise, options.model_error, options.prior, missing=missing)
     contrast = completed(contrast, missing, crop, known)
     contact = 1 + 2 * ratio * filtered(contrast, known.inverse)
     mu = column(2 * wavenumber(exposures.energy_kev) * exposures.refraction(delta, beta)[1])
@@ -119,7 +119,7 @@ def contrast_transfer(
     contrast, crop = surrounded(frames, exposures)
     raster = Raster((contrast.shape[-2], contrast.shape[-1]), exposures.views.pixel_size)
     h = response(exposures, beta / delta, raster)
-    known = spectra(frames, exposures, h, raster, options.noise, options.model_error, options.prior)
+    known = spectra(frames, exposures, h, raster, options.noise, options.model_error, options.prior, missing=missing)
     contrast = completed(contrast, missing, crop, known)
     return (-filtered(contrast, known.inverse) * radian(exposures, delta))[crop].to(frames.dtype)
 

@@ -115,7 +115,7 @@ class WaveModel:
             frames.dtype,
         ).to(self.frames.device)
         h, prior = response(exposures, ratio, self.raster), prior or (FIXED if leaves else None)
-        self.spectra = spectra(frames, exposures, h, self.raster, noise, MODEL_ERROR, prior)
+        self.spectra = spectra(frames, exposures, h, self.raster, noise, MODEL_ERROR, prior, missing=missing)
         self.strongest = column(sensitivity(exposures, ratio) ** 2)
         self.support, self.phase = self._spread(estimate)
 

@@ -19,7 +19,7 @@ from ...checks import at_least, finite, require, shaped
 from ...ranges import Weight, ranged
 from ...scan import Exposures
 from ...units import wavelength, wavenumber
-from ..noise import noise_levels
+from ..noise import noise_levels, with_gaps
 from ..noise_model import NoiseModel
 from ..sampling import smooth_margin
 
@@ -148,8 +148,8 @@ def finest_phase(exposures: Exposures) -> np.ndarray:
 
 
 def contrast_level(frames: Tensor) -> Tensor:
-    """Root mean square [V] of `I - 1`, float64."""
-    return (frames.detach().double() - 1).square().mean(dim=(1, 2)).sqrt()
+    """Root mean square [V] of `I - 1`, float64, of pixels that are not NaN."""
+    return (frames.detach().double() - 1).square().nanmean(dim=(1, 2)).sqrt()
 
 
 @dataclass(frozen=True)
@@ -228,16 +228,19 @@ def spectra(
     prior: Prior | None = None,
     *,
     leaks: bool = False,
+    missing: Gaps = None,
 ) -> Spectra:
-    """Of frames [V, H, W] and a response h on `raster`; noise: theirs, or None to estimate it (as white noise).
+    """Of frames [V, H, W] and a response h on `raster`; noise: theirs, or None to estimate it (as white noise);
+    missing: pixels without a value.
 
     model_error: the part of the frames' contrast that no model explains. The power has the prior's shape, or the one
     that the frames show themselves (`expected_shapes`), and explains the frames' variance beyond their noise, at the
     frequencies that the detector resolves. leaks: whether what a frame's edges mix into a frequency counts as
     unexplained, for what iterates and restores by its bounds what is damped so.
     """
-    level, grain = _levels(frames, exposures, raster, noise)
-    contrast = contrast_level(frames)
+    known = with_gaps(frames, missing)
+    level, grain = _levels(known, exposures, raster, noise)
+    contrast = contrast_level(known)
     all_noise = noise.level if isinstance(noise, NoiseModel) else level
     signal = (contrast.square() - all_noise.square()).clamp_min(LEAST_SIGNAL * contrast.square() + TINY)
     f2, field = squared_frequency(raster), math.prod(exposures.views.shape) * exposures.views.pixel_size**2
