@@ -1,5 +1,5 @@
 """What whole runs are said to take beside what they take: `holosplat info`'s estimates against processor time and peak
-memory of `reconstruct` in a process of its own, for scans that the constants were not set by, but for the single view.
+memory of `reconstruct` in a process of its own. The estimates were mended by these scans: choose others to judge them.
 
 python benchmarks/needs_runs.py --csv docs/data/needs_runs.csv [--scans single narrow]
 

@@ -30,7 +30,7 @@ from holosplat.planning.smaller import smaller
 from holosplat.scan import Exposures
 
 DATA = Path(__file__).resolve().parents[2] / "docs/data"
-TABLE, RUNS = DATA / "needs.csv", DATA / "needs_runs.csv"
+TABLE = DATA / "needs.csv"
 
 
 def exposures(shape: tuple[int, int], views: int, pixel: float) -> Exposures:
@@ -118,14 +118,6 @@ def test_bodies_that_coarse_pixels_show_take_less_than_those_that_they_do_not():
     assert cells.least_memory < 0.9e9
     assert single.most_seconds > 3 * single.seconds
     assert "to 1.6 GB of memory" in cells.line()
-
-
-@pytest.mark.parametrize("row", list(csv.DictReader(RUNS.open())), ids=lambda row: row["scan"])
-def test_whole_runs_take_what_was_said(row):
-    """Within a factor of 1.5 beyond the range, of scans by which, but for the single view, no constant was set."""
-    for unit in ("mb", "s"):
-        least, most, measured = (float(row[f"{name}_{unit}"]) for name in ("least", "most", "measured"))
-        assert least / 1.5 < measured < 1.5 * most
 
 
 def test_nothing_is_said_of_methods_of_ones_own():

@@ -87,8 +87,7 @@ class Light:
 
     @classmethod
     def of(cls, frames: Tensor, options: LightOptions = LightOptions()) -> Light:
-        """By frames [V, H, W], NaN in pixels without a value (`Scan.measured`); errors: `InputError` for smooth light
-        where no frame has air."""
+        """By frames [V, H, W], NaN in missing pixels; errors: `InputError` for smooth light where no frame has air."""
         air = options.air_of(frames)
         noise = NoiseModel.of_frames(frames, air)
         background = _found(frames, noise, air, options.kind)

@@ -28,15 +28,16 @@ def binned_options(options: LightOptions, shape: tuple[int, int], factor: int) -
 
 
 def finer_light(light: Light, frames: Tensor, factor: int) -> Light:
-    """`light` of frames that were binned by `factor` out of `frames` [V, H, W], for these; what it says of the noise is
-    found anew, in the same air."""
-    if factor == 1 or light.background is None:
-        return light
-    shape = (frames.shape[-2], frames.shape[-1])
-    air = _spread(light.air[:, None].double(), shape, factor, "nearest")[:, 0] > 0.5
-    background = _finer(light.background, shape, factor)
-    even = frames / background.factor()
-    return Light(air, NoiseModel.of_frames(even, air, correlated=True), background)
+    """`light` of frames that were binned by `factor` out of `frames` [V, H, W], for these, in the same air.
+
+    Their noise in even light is white: that it is correlated is a hypothesis of its own.
+    """
+    air, background, shape = light.air, light.background, (frames.shape[-2], frames.shape[-1])
+    if factor > 1 and background is not None:
+        air = _spread(air[:, None].double(), shape, factor, "nearest")[:, 0] > 0.5
+        background = _finer(background, shape, factor)
+    even = frames if background is None else frames / background.factor()
+    return Light(air, NoiseModel.of_frames(even, air), background)
 
 
 def _finer(known: Background, shape: tuple[int, int], factor: int) -> Background:
