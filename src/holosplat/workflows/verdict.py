@@ -174,8 +174,8 @@ def judge_run(found: Stored, fit: Running | None, task: Task, oversample: int) -
     Frames in uneven light are flat-field corrected; the uncertainty of the light counts as noise.
     """
     said, fitted = said_of_run(found, fit, task, oversample)
-    found = judge(said, fitted, task.noise if task.uneven and said.light is None else None)
-    return found if found.good else _about_another_axis(found, task.scan)
+    verdict = judge(said, fitted, task.noise if task.uneven and said.light is None else None)
+    return verdict if verdict.good else _about_another_axis(verdict, task.scan)
 
 
 def _about_another_axis(found: Verdict, frames: Scan) -> Verdict:
