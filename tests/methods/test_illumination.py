@@ -16,7 +16,7 @@ from holosplat.matter import DeltaBeta, MaterialPrior, Matter
 from holosplat.methods import SmoothVolume, Task
 from holosplat.methods.first_volumes import BY_FISSION, BY_VIEWS, FirstVolumes, Folds
 from holosplat.methods.illumination import STAGE, decided, prepared
-from holosplat.methods.trials import UNEVEN, first_of_task, plain_light
+from holosplat.methods.trials import UNEVEN, Trials, first_of_task, plain_light
 from holosplat.optics.background import FLUX, Background, Light, LightOptions
 from holosplat.representations import VoxelGrid
 from holosplat.scan import Exposures, Scan
@@ -92,14 +92,20 @@ def test_fits_confirm_uneven_light(in_uneven_light):
     assert "uneven light" in last.choice
 
 
-def test_fits_refuse_what_steadies_first_volumes(soft, monkeypatch):
-    """Grain that a first volume finds in even light and white noise is what it leaves of the matter."""
-    monkeypatch.setattr("holosplat.methods.illumination.decided", lambda *how: (("correlated noise",), ()))
+def test_fits_refuse_what_does_not_help_them(soft, monkeypatch):
+    """A pattern that a first volume finds in even light is next to nothing."""
+
+    def forced(first: FirstVolumes, options: LightOptions, *_: object) -> tuple[tuple[str, ...], tuple[()]]:
+        Trials(first, options).proposed(("fixed pattern",))
+        return ("fixed pattern",), ()
+
+    monkeypatch.setattr("holosplat.methods.illumination.decided", forced)
     task = prepared(Task(soft, PRIOR), SmoothVolume())
     last = [each for each in task.decisions if each.name == STAGE][-1]
     assert last.choice == "as measured"
     assert len(last.compared) == 1
-    assert not task.noise.has_grain
+    assert task.lit is not None
+    assert task.lit.still is None
 
 
 def test_a_volume_worse_than_none_says_nothing_of_light(sharp, monkeypatch):

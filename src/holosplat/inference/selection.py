@@ -93,7 +93,7 @@ def select(
     *,
     by: str,
     beside: Mapping[str, Sequence[str]] | None = None,
-    patient: bool = False,
+    surely: bool = True,
 ) -> Decision:
     """The candidate that predicts unseen frames best, by the policy of `Compared.wins`.
 
@@ -101,7 +101,7 @@ def select(
     by the caller; folds: how many there are. Folds are looked at one after another, as long as the candidate wins; it
     is taken only if it wins over all of them, where the frames, and not their blocks, give the standard error: frames
     differ by more than their parts do. by: how unseen frames came about; beside: other names that a candidate must win
-    against, too. patient: whether folds are looked at, too, where a gain of practical size is not sure yet.
+    against, too. surely: whether a gain must be sure; where another score has told that, its size is enough.
     """
     require(len(candidates) > 0, "a selection needs at least one candidate, but there is none.")
     began, best, compared = time.perf_counter(), candidates[0], list[Compared]()
@@ -109,10 +109,10 @@ def select(
         rivals = (best, *(beside or {}).get(candidate, ()))
         found = _least(candidate, rivals, score, range(1))
         for last in range(1, folds):
-            if found.wins or (patient and found.large):
+            if found.wins:
                 found = _least(candidate, rivals, score, range(last + 1))
         compared.append(found)
-        if found.wins:
+        if found.wins or (found.large and not surely):
             best = candidate
     return Decision(name, best, by, tuple(compared), round(time.perf_counter() - began, 2))
 

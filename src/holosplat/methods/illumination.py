@@ -61,10 +61,10 @@ def confirmed(task: Task, first: FirstVolumes, told: Hypothesis) -> Decision:
     """What first volumes have taken of light and noise beside what is told, against fits of smooth volumes.
 
     A first volume gains by a hypothesis that only steadies it: what it leaves of matter passes for correlated noise, or
-    for light. A fit through the waves, in units of the noise, leaves less. One fold is asked, as first volumes have won
-    in all of them, and the others where its gain is of practical size, but not sure.
+    for light. A fit through the waves, in units of the noise, leaves less. That there is a gain, first volumes have
+    shown in every fold; by fits to one of them it must be of practical size.
     """
-    fits = TrialFits(task, first, {"continuous": SmoothVolume().with_effort(EFFORT)})
+    fits = TrialFits(task, first, {"continuous": SmoothVolume(rounds=1).with_effort(EFFORT)})
     counts = range(len(told), len(first.taken))
     candidates = [name_of(first.taken[:count]) for count in (*counts, len(first.taken))]
     beside = {name_of(first.taken[: n + 1]): rivals(first.taken[:n], first.taken[n]) for n in counts}
@@ -73,10 +73,7 @@ def confirmed(task: Task, first: FirstVolumes, told: Hypothesis) -> Decision:
     def scored(name: str, fold: int) -> Score:
         return fits.score(name, "continuous", fold)
 
-    once = select(STAGE, candidates, scored, by=by, beside=beside)
-    if all(each.wins or not each.large for each in once.compared):
-        return once
-    return select(STAGE, candidates, scored, first.folds.count, by=by, beside=beside, patient=True)
+    return select(STAGE, candidates, scored, by=by, beside=beside, surely=False)
 
 
 def prepared(task: Task, method: Method | None = None, before: Prepared | None = None) -> Task:
