@@ -15,12 +15,16 @@ from ..optics.camera import Camera
 from ..optics.illumination import Illumination
 from ..optics.resampling import Flip
 from ..units import span
-from ..workflows.air_light import OFF
 from ..workflows.correct import Corrected, CorrectionOptions
 from ..workflows.correct import correct as correct_file
 from ..workflows.join import join as join_files
 from .places import Output
 from .progress import ProgressBar
+
+OFF = 0.02
+"""How far air may be off 1 before it is warned of."""
+FAR = 0.1
+"""How far the light of all frames may be off their flat field before it is warned of."""
 
 
 def record(
@@ -68,7 +72,7 @@ def correct(raw: Positional[Path], out: Output, how: CorrectionOptions, reading:
         done = correct_file(raw, out, how, lambda fraction: bar.show("correcting frames", fraction, {}), reading)
     flat = f"flat fields of {done.components} components" if done.method == "dynamic" else "the mean flat field"
     _say(f"wrote {out}: {done.frames} frames by {flat}, normalised: {done.normalised}")
-    _say(_levels(done))
+    _say(_levels(done, how.normalise is not None or bool(how.air)))
     if how.method is None and done.method == "plain":
         _say(f"method plain, for the dynamic one needs three flats, and the file has {done.flats}")
     if done.rings:
@@ -78,8 +82,8 @@ def correct(raw: Positional[Path], out: Output, how: CorrectionOptions, reading:
     _say(f"filled defective pixels from their neighbours: {done.marked} marked in the file, {done.found} found beside")
 
 
-def _levels(done: Corrected) -> str:
-    """What frames were divided by, and how bright their air is then."""
+def _levels(done: Corrected, is_asked: bool) -> str:
+    """What frames were divided by, and how bright their air is then; is_asked: whether --normalise or --air says so."""
     low, high = done.divided
     what = {"air": "the light in its air", "mean": "its own mean", "rim": "the mean of its rim"}.get(done.normalised)
     said = [f"each frame was divided by {what}, {span(np.array([low, high]))}" if what else "light was not normalised"]
@@ -89,12 +93,11 @@ def _levels(done: Corrected) -> str:
     else:
         said.append("no air was found to check it by (give boxes of it by --air)")
     if done.air is not None and abs(done.air - 1) > OFF:
-        wrong.append(
-            "air must be 1: if matter fills the frames, this is what it absorbs; if it is air, take --normalise air, "
-            "and see whether flats and darks are those of the frames"
-        )
+        wrong.append("air must be 1: take --normalise air, and see whether flats and darks are those of the frames")
     if done.normalised == "mean" and done.air is None:
         wrong.append("what all of a frame absorbs is lost; take --normalise none if flats had the same light")
+    if not is_asked and what and (high < 1 - FAR or low > 1 + FAR):
+        wrong.append("if matter fills the frames, this was its absorption, and --normalise none keeps it")
     return ("warning: " if wrong else "") + "; ".join([*said, *wrong])
 
 

@@ -19,8 +19,6 @@ LONGEST = 128
 """Pixels along the longer side of the binned frames, at most."""
 BESIDE = 0.05
 """Width of the left and the right border, as a part of a frame's."""
-OFF = 0.02
-"""How far air may be off 1, the light of the flats."""
 BRIGHTER = 0.02
 """Where a border is brighter than the frame's mean by this part, it shows air, or less matter than the middle."""
 
@@ -89,13 +87,6 @@ class AirLight:
         powers = known.powers.numpy() * look.factor**2
         doubt = DividedLight(left.numpy(), variances.numpy(), powers, look.shape)
         return cls(coefficients.numpy(), int((~usable).sum()), doubt)
-
-    def meets(self, look: Look, flats: np.ndarray) -> bool:
-        """Whether the light of some frame is within the levels [F] of the flats, relative to their mean, or frames are
-        on both sides of these: light that changes passes there, and matter that fills all frames does not."""
-        shape = (look.frames.shape[1], look.frames.shape[2])
-        levels = np.array([self.factor(n, shape).mean() for n in range(len(look.frames))])
-        return bool(levels.max() > flats.min() - OFF and levels.min() < flats.max() + OFF)
 
     def factor(self, number: int, shape: tuple[int, int]) -> np.ndarray:
         """The light [H, W] of projection `number`."""

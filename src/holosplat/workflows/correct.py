@@ -53,8 +53,8 @@ class CorrectionOptions:
     dynamic with three flats or more)."""
     normalise: Normalise | None = None
     """What is brought to 1 in each frame: its air, by a smooth factor, its mean, its rim, or nothing (default: the air
-    where it is uneven beyond its noise and as bright as a flat in some frame; the mean where flats change, and
-    neither air nor a border brighter than the rest is seen; else nothing)."""
+    where it is uneven beyond its noise; the mean where flats change, and neither air nor a border brighter than the
+    rest is seen; else nothing)."""
     air: tuple[Box, ...] = ()
     """Boxes without matter in any frame: first row, end row, first column, end column (default: found)."""
     rings: int | None = None
@@ -141,11 +141,6 @@ class FlatFielding:
         if self.eigen is None or self._weights is None:
             return self.light
         return self.eigen.light(self._weights(raw - self.dark))
-
-    def flat_levels(self) -> np.ndarray:
-        """[F] brightness of the flats, relative to their mean."""
-        levels = np.array([(self.repair(self.file.frame(n)) - self.dark).mean() for n in self._flats])
-        return levels / levels.mean()
 
     def _eigen_flats(self) -> EigenFlats:
         """Principal components of the flats, read twice by rows and once whole for their means and repairs."""
@@ -250,8 +245,6 @@ class Normalisation:
             numbers = fielding.file.numbers(PROJECTION)
             look = Look.at(lambda i: fielding(int(numbers[i])), len(numbers))
             self.light = AirLight.of(look, options.air, asked)
-            if not asked and self.light is not None and not self.light.meets(look, fielding.flat_levels()):
-                self.light = None
         require(
             not asked or self.light is not None,
             f"{self._path}: no projection shows air; give boxes of it by --air, or take --normalise mean.",
