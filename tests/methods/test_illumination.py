@@ -11,14 +11,13 @@ import torch
 from holosplat.baselines import holographic_tv
 from holosplat.beamline.light import UnevenLight, correlated_field
 from holosplat.beamline.simulate import simulate
-from holosplat.geometry import Grid, Views
-from holosplat.matter import DeltaBeta, MaterialPrior, Matter
+from holosplat.geometry import Views
+from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import SmoothVolume, Task
 from holosplat.methods.first_volumes import BY_FISSION, BY_VIEWS, FirstVolumes, Folds
-from holosplat.methods.illumination import STAGE, decided, prepared
-from holosplat.methods.trials import UNEVEN, Trials, first_of_task, plain_light
-from holosplat.optics.background import FLUX, Background, Light, LightOptions
-from holosplat.representations import VoxelGrid
+from holosplat.methods.illumination import STAGE, prepared
+from holosplat.methods.trials import Trials, first_of_task, plain_light
+from holosplat.optics.background import Background, LightOptions
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.red_cells import random_cells
 from holosplat.specimens.scene import MeshScene
@@ -106,21 +105,6 @@ def test_fits_refuse_what_does_not_help_them(soft, monkeypatch):
     assert len(last.compared) == 1
     assert task.lit is not None
     assert task.lit.still is None
-
-
-def test_a_volume_worse_than_none_says_nothing_of_light(sharp, monkeypatch):
-    """In light that leaves no matter, frames are predicted better than by it, and as well as without any volume."""
-
-    def volume(first: FirstVolumes, fold: int, light: Light) -> VoxelGrid:
-        grid = Grid.of_views(first.folds.split(fold)[0].views)
-        draw = torch.rand((1, *grid.shape), generator=torch.Generator().manual_seed(2))
-        return VoxelGrid(draw * (light.background is None), grid, Matter.one(*MATTER))
-
-    monkeypatch.setattr(FirstVolumes, "volume", volume)
-    task = Task(lit(sharp, uneven()), PRIOR)
-    taken, (made, *_) = decided(first_of_task(task), LightOptions(), (), (FLUX, UNEVEN))
-    assert taken == ()
-    assert made.compared
 
 
 @pytest.mark.parametrize("family", ["soft", "sharp"])

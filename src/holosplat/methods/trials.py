@@ -25,8 +25,7 @@ UNEVEN = "uneven light"
 FREE = "; of unseen frames free: "
 """A rival of light of each frame's own: the volume before it, whose prediction is allowed the same light."""
 WITHOUT = "; without matter"
-"""A rival of every hypothesis: the same without its volume. Light that leaves nothing for matter to explain beats a
-volume that is worse than none, and says nothing of light."""
+"""The same without its volume: a volume that predicts frames worse than none decides nothing."""
 
 Hypothesis = tuple[str, ...]
 """What is added to the null, in the order in which it was taken."""
@@ -43,15 +42,14 @@ def named(name: str) -> Hypothesis:
 
 
 def hypothesis_of(name: str) -> Hypothesis:
-    """That of a name, or of one of its `rivals`."""
+    """That of a name, of one of its `rivals`, or of the same without matter."""
     return named(name.partition(";")[0])
 
 
 def rivals(before: Hypothesis, one: str) -> tuple[str, ...]:
-    """What `one` must win against beside the hypothesis `before` it: the same without matter and, where it is light of
-    each frame's own, the volume before it in such light."""
-    without = name_of((*before, one)) + WITHOUT
-    return (without, name_of(before) + FREE + one) if one in (FLUX, UNEVEN) else (without,)
+    """What `one` must win against beside the hypothesis `before` it: where it is light of each frame's own, the volume
+    before it in such light."""
+    return (name_of(before) + FREE + one,) if one in (FLUX, UNEVEN) else ()
 
 
 @dataclass(frozen=True)
@@ -114,7 +112,7 @@ class Trials:
         return power > MARGIN**2 * float(left.double().square().nanmean())
 
     def score(self, name: str, fold: int) -> Score:
-        """That of a hypothesis by its name, or of one of its `rivals`."""
+        """That of a hypothesis by its name, of one of its `rivals`, or of the same without matter."""
         return self.score_of(name, fold, self.tried(hypothesis_of(name), fold).expected)
 
     def score_of(self, name: str, fold: int, expected: Tensor) -> Score:
