@@ -42,7 +42,7 @@ SCANS: dict[str, tuple[tuple[object, ...], tuple[str, ...]]] = {
         (),
     ),
 }
-"""Specimens, or else the cells of the demo; how they are simulated, and what is told of their matter."""
+"""Specimens, or else the cells of the demo; how they are simulated, and the options of `reconstruct`."""
 LIKE_CELLS = ("cells", "single", "noisy")
 
 

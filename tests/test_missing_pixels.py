@@ -24,6 +24,7 @@ from holosplat.io.reading import Part, Reading
 from holosplat.materials import parse_material
 from holosplat.matter import Matter
 from holosplat.model import Instrument
+from holosplat.optics.noise import left_of
 from holosplat.optics.noise_model import NoiseModel
 from holosplat.optics.retrieval import RETRIEVALS
 from holosplat.preprocess.pixels import filled
@@ -125,3 +126,16 @@ def test_a_scan_knows_its_missing_pixels_through_cuts_and_files(tmp_path):
     np.testing.assert_allclose(coarse.frames, 1)
     join([tmp_path / "a.nxs"] * 2, tmp_path / "joined.nxs", flips=["rows", "none"])
     np.testing.assert_array_equal(read_scan(tmp_path / "joined.nxs").missing, np.concatenate([lacks[:, ::-1], lacks]))  # type: ignore[arg-type]
+
+
+def test_what_is_predicted_without_a_value_is_not_forgiven():
+    """Only what was not measured leaves nothing: a prediction that is not a number explains no frame."""
+    frames, lacks = np.ones((N, *SHAPE), np.float32), np.zeros((N, *SHAPE), bool)
+    lacks[2, 4, 5] = True
+    scan = Scan(frames, a_scan().exposures, np.zeros(N, bool), missing=lacks)
+    said = torch.ones(N, *SHAPE)
+    said[1, 2, 3] = said[2, 4, 5] = torch.nan
+    for left in (scan.left(said), left_of(scan.measured, said)):
+        assert left[2, 4, 5] == 0
+        assert left[1, 2, 3].isnan()
+        assert int(left.isnan().sum()) == 1

@@ -315,7 +315,8 @@ class Scan:
 
     def left(self, predicted: Tensor) -> Tensor:
         """The frames [N, H, W] less those predicted, 0 in missing pixels."""
-        return (self.measured - predicted).nan_to_num()
+        measured = self.measured
+        return (measured - predicted).masked_fill(measured.isnan(), 0.0)
 
     @property
     def views(self) -> Views:

@@ -16,8 +16,8 @@ from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import SmoothVolume, Task
 from holosplat.methods.first_volumes import BY_FISSION, BY_VIEWS, FirstVolumes, Folds
 from holosplat.methods.illumination import STAGE, prepared
-from holosplat.methods.trials import Trials, first_of_task, plain_light
-from holosplat.optics.background import Background, LightOptions
+from holosplat.methods.trials import UNEVEN, Trials, first_of_task, plain_light, with_more
+from holosplat.optics.background import Background, Light, LightOptions
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.red_cells import random_cells
 from holosplat.specimens.scene import MeshScene
@@ -89,6 +89,23 @@ def test_fits_confirm_uneven_light(in_uneven_light):
     last = [each for each in task.decisions if each.name == STAGE][-1]
     assert last.by == "views set aside, by fits"
     assert "uneven light" in last.choice
+
+
+def test_light_is_applied_as_it_was_compared():
+    """That of coarse pixels: on fine ones, other parts of a frame pass for air. Its noise is white."""
+    shape = (97, 150)
+    y, x = np.mgrid[: shape[0], : shape[1]] / np.array(shape)[:, None, None] - 0.5
+    light = np.stack([1 + 0.1 * (a * x + b * y) for a, b in ((1, 0.5), (-0.6, 1), (0.3, -1))])
+    skirt = 1 - 0.2 * np.exp(-((x / 0.1) ** 2) - (y / 0.15) ** 2)
+    frames = (light * skirt * (1 + 1e-3 * np.random.default_rng(3).normal(size=light.shape))).astype(np.float32)
+    scan = Scan(frames, Exposures.of(Views.evenly_spaced(3, shape, PIXEL), 20.0, 0.1), np.zeros(3, dtype=bool))
+    options = LightOptions()
+    found = with_more(plain_light(scan.measured, options), UNEVEN, scan, scan.measured, options)
+    compared = Light.of(scan.binned(3).measured, LightOptions("smooth"))
+    assert found is not None
+    assert torch.equal(found.part(torch.arange(3), 3).air, compared.air)
+    torch.testing.assert_close(found.part(torch.arange(3), 3).factor(), compared.factor(), rtol=0, atol=2e-3)
+    assert not found.noise.has_grain
 
 
 def test_fits_refuse_what_does_not_help_them(soft, monkeypatch):

@@ -12,6 +12,7 @@ from torch import Tensor
 from ..geometry import Views
 from ..inference import Compared, Decision, Score, select
 from ..matter import DeltaBeta
+from ..optics.noise import left_of
 from ..optics.retrieval import Tikhonov, tikhonov
 from ..scan import Scan
 from .derivatives import in_pixels
@@ -52,7 +53,7 @@ def mirrored(frames: Tensor, predicted: Tensor) -> list[str]:
     images = {"": frames, **{side: frames.flip(axes) for side, axes in SIDES.items()}}
     found = list[str]()
     for v in range(len(frames)):
-        scores = {side: Score.of((image[[v]] - predicted[[v]]).nan_to_num()) for side, image in images.items()}
+        scores = {side: Score.of(left_of(image[[v]], predicted[[v]])) for side, image in images.items()}
         found.append(select("mirrored", tuple(scores), lambda side, fold, of=scores: of[side], by="a frame").choice)
     return found
 

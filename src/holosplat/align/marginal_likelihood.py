@@ -13,6 +13,7 @@ from torch.nn.functional import interpolate
 from ..geometry import Grid, Views
 from ..inference import Decision
 from ..matter import DeltaBeta
+from ..optics.noise import left_of
 from ..optics.retrieval.spectra import Raster, radian, response
 from ..optics.sampling import fringe_sampling
 from ..projectors.voxels import LatticeProjector
@@ -322,7 +323,7 @@ def _information(
         grid,
         exposures,
         search.material,
-        left=blurred((scan.measured[train] / lit - images).nan_to_num(), blur).square().mean((1, 2)),
+        left=blurred(left_of(scan.measured[train] / lit, images), blur).square().mean((1, 2)),
         leeway=SOFT if surfaces is None else SHARP,
         blur=blur,
         places=[SLOPES[place] for place in places],

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..optics.noise import left_of
 from .derivatives import Predicted
 
 
@@ -29,7 +30,7 @@ class Normal:
         blur: standard deviation of a Gaussian [pixels] by which images are compared. The noise of a view is what it
         leaves unexplained, as it is after that blur: this many independent pixels."""
         known = ~measured.isnan()
-        missing = blurred((measured - found.frames).nan_to_num(), blur).flatten(1).double()
+        missing = blurred(left_of(measured, found.frames), blur).flatten(1).double()
         columns = blurred(found.derivatives * known[:, None], blur).flatten(2).double()
         independent = 1 / (4 * math.pi * blur**2)
         scale = independent / (missing.square().sum(1) / known.sum((1, 2))).clamp_min(1e-18)
@@ -76,7 +77,7 @@ def blurred(images: Tensor, sigma: float) -> Tensor:
 
 def unexplained(measured: Tensor, images: Tensor) -> Tensor:
     """[V, H, W] what images leave of frames, over each frame's contrast; 0 in pixels of these that are NaN."""
-    return (measured - images).nan_to_num() / contrast_of(measured)
+    return left_of(measured, images) / contrast_of(measured)
 
 
 def contrast_of(measured: Tensor) -> Tensor:

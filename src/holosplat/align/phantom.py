@@ -18,6 +18,7 @@ from ..geometry import Grid, Views
 from ..matter import DeltaBeta, Matter
 from ..mesh import TriangleMesh
 from ..model import Alignment, Instrument
+from ..optics.noise import left_of
 from ..projectors.surface import surface_occupancy
 from ..representations import SurfaceMesh
 from ..scan import Exposures
@@ -288,7 +289,7 @@ def solved(
     """
     views, count = len(measured), len(numbers[1])
     known = ~measured.isnan()
-    missing = blurred((measured.double() - found.frames).nan_to_num(), blur).flatten(1)
+    missing = blurred(left_of(measured.double(), found.frames), blur).flatten(1)
     of_views = blurred(found.of_views * known[:, None], blur).flatten(2)
     of_all = (blurred(found.of_all * known, blur) if count else found.of_all).flatten(2)
     independent = 1 / (4 * math.pi * blur**2)

@@ -21,10 +21,12 @@ CONTRAST = 0.5
 """Of the contrast's root mean square, in the images."""
 
 
-def retrieved_thickness(frames: Tensor, exposures: Exposures, material: DeltaBeta) -> Tensor:
-    """Projected thickness [V, H, W] [m] of `material` in relative frames [V, H, W], each by itself; errors: those of
-    `tikhonov`."""
-    return tikhonov(frames, exposures, *material, options=RETRIEVAL)
+def retrieved_thickness(
+    frames: Tensor, exposures: Exposures, material: DeltaBeta, missing: Tensor | None = None
+) -> Tensor:
+    """Projected thickness [V, H, W] [m] of `material` in relative frames [V, H, W], each by itself; missing: pixels
+    [V, H, W] bool without a value; errors: those of `tikhonov`."""
+    return tikhonov(frames, exposures, *material, options=RETRIEVAL, missing=missing)
 
 
 def seen_in(scan: Scan, material: DeltaBeta) -> tuple[Tensor, Tensor, Tensor]:
@@ -34,7 +36,7 @@ def seen_in(scan: Scan, material: DeltaBeta) -> tuple[Tensor, Tensor, Tensor]:
     Missing pixels have no weight: they show the contrast that the retrieved thickness has there.
     """
     frames, optics = torch.from_numpy(scan.frames), scan.exposures.optical
-    thickness = tikhonov(frames, scan.exposures, *material, options=RETRIEVAL, missing=scan.gaps)
+    thickness = retrieved_thickness(frames, scan.exposures, material, scan.gaps)
     if scan.gaps is not None:
         samples = fringe_sampling(optics)
         frames = torch.where(

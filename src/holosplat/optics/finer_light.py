@@ -14,14 +14,15 @@ from .patterns import smooth_modes
 
 def binned_options(options: LightOptions, shape: tuple[int, int], factor: int) -> LightOptions:
     """`options` of frames of `shape` (H, W) for pixels `factor` times larger, as `Scan.binned` makes them: boxes of air
-    hold the pixels that lie in them, and one at least."""
+    hold the pixels that lie in them, or else the one about their middle."""
     if factor == 1 or not options.air:
         return options
 
     def side(first: int, end: int, count: int) -> tuple[int, int]:
         cut, few = (count % factor) // 2, count // factor
-        start = min(max(0, -((cut - first) // factor)), few - 1)
-        return start, min(max((end - cut) // factor, start + 1), few)
+        start, stop = max(0, -((cut - first) // factor)), min((end - cut) // factor, few)
+        middle = min(max(0, ((first + end) // 2 - cut) // factor), few - 1)
+        return (start, stop) if start < stop else (middle, middle + 1)
 
     boxes = [(*side(top, bottom, shape[0]), *side(left, right, shape[1])) for top, bottom, left, right in options.air]
     return replace(options, air=tuple(boxes))

@@ -26,6 +26,11 @@ def with_gaps(frames: Tensor, missing: Tensor | None) -> Tensor:
     return frames if missing is None else frames.masked_fill(missing.to(frames.device), torch.nan)
 
 
+def left_of(measured: Tensor, predicted: Tensor) -> Tensor:
+    """Frames [V, H, W] less those predicted, 0 where they are NaN; what is predicted without a value stays NaN."""
+    return (measured - predicted).masked_fill(measured.isnan(), 0.0)
+
+
 def noise_level(images: Tensor) -> float:
     """Standard deviation of white noise on images [V, H, W].
 
