@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 from helpers.holographic import CELL, PIXEL, SHAPE, cells, scan_of
 from holosplat.baselines import HolographicTV, holographic_tv
 from holosplat.baselines.holographic_tv import Correction
-from holosplat.baselines.material import estimate_delta, estimate_ratio, plateau
+from holosplat.baselines.material import estimate_delta, estimate_ratio
+from holosplat.baselines.tomography import plateau
 from holosplat.beamline.light import UnevenLight
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views, rotation_y

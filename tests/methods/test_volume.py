@@ -12,7 +12,7 @@ import torch
 
 from helpers.soft import MATERIAL, PIXEL, cells, two_cells
 from holosplat.baselines import HolographicTV
-from holosplat.baselines.material import plateau
+from holosplat.baselines.tomography import plateau
 from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
 from holosplat.fit.smooth_volume import ContinuousPrior, VolumeProblem, descend

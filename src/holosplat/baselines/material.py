@@ -17,7 +17,7 @@ from ..progress import Progress
 from ..ranges import Weight, ranged
 from ..scan import Scan
 from .rays import rays_of
-from .tomography import TotalVariation, tv_solver
+from .tomography import TotalVariation, plateau, tv_solver
 
 TRIAL_DELTA = 1e-6
 """Any size will do: the retrieved D = δT does not depend on it."""
@@ -103,29 +103,6 @@ def estimate_delta(
     on_progress("estimate of delta", 0.0)
     coarse = scan.coarsened(max(1, round(scan.views.shape[1] / (2 * options.width))))
     return plateau(_trial_volume(coarse, ratio, backend, options, sign)) * sign * TRIAL_DELTA
-
-
-def plateau(occupancy: Tensor) -> float:
-    """The level [units of `occupancy`] that most of the matter has: the mass-weighted median of [Z, Y, X] ≥ 0."""
-    values = occupancy[occupancy > 0].sort().values
-    if not len(values):
-        raise NoMatterError
-    mass = values.double().cumsum(0)
-    return float(values[int(torch.searchsorted(mass, 0.5 * mass[-1]))])
-
-
-def level_of(occupancy: Tensor) -> float:
-    """The level [units of `occupancy`] of matter with one level beside a faint haze, both in [Z, Y, X] ≥ 0.
-
-    The `plateau` of the denser of the two classes whose means differ most for their numbers (Otsu 1979): of small
-    bodies in a large field, haze may have more mass.
-    """
-    values = occupancy.double().flatten().sort(descending=True).values
-    require(bool(values[0] > 0), "an empty volume has no level; look at its frames first.")
-    count = torch.arange(1, len(values), dtype=values.dtype)
-    upper = values.cumsum(0)[:-1]
-    between = (upper * len(values) - values.sum() * count).square() / (count * (len(values) - count))
-    return plateau(occupancy * (occupancy >= values[int(between.argmax())]))
 
 
 def _trial_volume(scan: Scan, ratio: float, backend: Backend, options: MaterialEstimate, sign: float) -> Tensor:

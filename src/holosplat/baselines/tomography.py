@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..checks import NoMatterError, require
 from ..geometry import Grid, Views
 from ..memory import memory_kept
 from ..metrics.correlation import shortest_side
@@ -22,6 +23,8 @@ from .rays import Rays, checked_upper, rays_of
 
 QUIETEST = 1e-4
 """The misfit's spectrum is taken to be nowhere below this fraction of its mean."""
+LEVEL_STEPS = 20
+"""Steps after which the level of the matter is looked at again, where there is no bound."""
 
 
 class Tomography(Protocol):
@@ -109,6 +112,9 @@ def tv_solver(
 ) -> PrimalDual:
     """The solver of `total_variation` after its last iteration, for those who go on from there.
 
+    Where there is no upper bound, the unit of the occupancy says nothing of the matter: the weight of total variation
+    is then per `level_of` the volume, found anew after every `LEVEL_STEPS`.
+
     weights: trust in each ray [V, H, W], above 0; with them, or with still light, frequencies are trusted alike to the
     end. Rays of missing pixels take the line integral of the volume, and so have no weight.
     """
@@ -123,7 +129,7 @@ def tv_solver(
         solver.with_still_light(smooth_modes(rays.views.shape, options.still_light, like.device)[1:])
     alike = weights is not None or options.still_light > 0
     images, total = rays.projector.lines_out(rays.measured), options.first + options.iterations
-    gaps, measured = rays.gaps(), images
+    gaps, measured, rms, level = rays.gaps(), images, 0.0, 1.0
     for done in range(total):
         on_progress(done / total)
         images = solver.completed(measured, gaps)
@@ -132,7 +138,9 @@ def tv_solver(
         if done == options.first and options.misfit > 0:
             missing = images - solver.lines()
             rms = float((missing - solver.still_light(images)).square().mean().sqrt())
-            solver.set_weight(max(options.weight, options.misfit * rms))
+        if upper is None and done % LEVEL_STEPS == 0 and bool((solver.volume > 0).any()):
+            level = level_of(solver.volume)
+        solver.set_weight(max(options.weight * level, options.misfit * rms))
         solver.run(images, 1)
     return solver
 
@@ -161,6 +169,29 @@ def misfit_spectrum(rays: Rays, misfit: Tensor) -> Tensor:
     means[0] = means[1]  # of the mean itself there is one sample only, and the bounds push it
     floor = QUIETEST * float(means.mean())
     return means.clamp_min(max(floor, 1e-12))[ring].reshape(power.shape).float()
+
+
+def plateau(occupancy: Tensor) -> float:
+    """The level [units of `occupancy`] that most of the matter has: the mass-weighted median of [Z, Y, X] ≥ 0."""
+    values = occupancy[occupancy > 0].sort().values
+    if not len(values):
+        raise NoMatterError
+    mass = values.double().cumsum(0)
+    return float(values[int(torch.searchsorted(mass, 0.5 * mass[-1]))])
+
+
+def level_of(occupancy: Tensor) -> float:
+    """The level [units of `occupancy`] of matter with one level beside a faint haze, both in [Z, Y, X] ≥ 0.
+
+    The `plateau` of the denser of the two classes whose means differ most for their numbers (Otsu 1979): of small
+    bodies in a large field, haze may have more mass.
+    """
+    values = occupancy.double().flatten().sort(descending=True).values
+    require(bool(values[0] > 0), "an empty volume has no level; look at its frames first.")
+    count = torch.arange(1, len(values), dtype=values.dtype)
+    upper = values.cumsum(0)[:-1]
+    between = (upper * len(values) - values.sum() * count).square() / (count * (len(values) - count))
+    return plateau(occupancy * (occupancy >= values[int(between.argmax())]))
 
 
 TOMOGRAPHIES: dict[str, Tomography] = {

@@ -33,7 +33,7 @@ from ..representations.voxels import VoxelLines
 from ..scan import Scan
 from ..units import wavelength
 from ..volume import LineIntegrals
-from .material import plateau
+from .tomography import plateau
 
 STEP, ITERATIONS = 1e-10, 5
 """Of the linearisation in β."""

@@ -138,24 +138,23 @@ def _applied(task: Task, light: Light, taken: Hypothesis) -> tuple[Scan, Light]:
     frames = torch.from_numpy(task.scan.frames)
     order = [one for one in HYPOTHESES if one in taken]
 
-    def evened() -> Scan:
+    def evened(light: Light) -> Scan:
         return replace(task.scan, frames=light.evened(frames).numpy().astype(np.float32))
 
+    def predict(light: Light) -> Tensor:
+        return predicted_first(evened(light), task.prior, HolographicTV(upper=0.0), task.on_progress, light)
+
     for one in order:
-        predicted = frames
-        if one != UNEVEN and not task.scan.is_series:
-            how = HolographicTV(upper=0.0)
-            predicted = predicted_first(evened(), task.prior, how, task.on_progress, light)
-        elif one != UNEVEN:
+        if one != UNEVEN and task.scan.is_series:
             continue  # several times have no one volume
-        found = with_more(light, one, task.scan, predicted, task.light)
+        found = with_more(light, one, task.scan, predict, task.light)
         if found is None:
             raise InputError(
                 "no frame shows air, by which smooth light could be told from matter; give boxes of it by --air, or "
                 "take --light even."
             )
         light = found
-    return evened() if order else task.scan, light
+    return evened(light) if order else task.scan, light
 
 
 def still_order(method: Method | None) -> int:

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..baselines.material import plateau
+from ..baselines.tomography import plateau
 from ..baselines.two_materials import best_levels, eroded, told_apart
 from ..checks import NoMatterError
 from ..inference import Decision, Score, select

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..baselines.beyond import rows_beyond
-from ..baselines.material import plateau
+from ..baselines.tomography import plateau
 from ..checks import require
 from ..fit.smooth_volume import ContinuousPrior, VolumeProblem
 from ..fit.whitened import WhitenedFrames

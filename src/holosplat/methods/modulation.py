@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool3d, avg_pool3d, interpolate
 
-from ..baselines.material import plateau
+from ..baselines.tomography import plateau
 from ..fit.smooth_volume import VolumeProblem
 
 SPREAD = 0.5

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ..baselines import HolographicTV, holographic_tv
 from ..baselines.beyond import rows_of
-from ..baselines.material import plateau
+from ..baselines.tomography import plateau
 from ..checks import at_least, require
 from ..fit.smooth_volume import ContinuousPrior, VolumeProblem, descend
 from ..fit.whitened import WhitenedFrames

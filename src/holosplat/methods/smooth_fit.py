@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..backends import device, resolve
-from ..baselines.material import plateau
+from ..baselines.tomography import plateau
 from ..fit.loop import DivergedError
 from ..fit.running import Record, interrupts_held
 from ..fit.smooth_volume import ContinuousPrior, Descent, VolumeProblem

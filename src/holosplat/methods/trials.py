@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -26,6 +27,9 @@ FREE = "; of unseen frames free: "
 """A rival of light of each frame's own: the volume before it, whose prediction is allowed the same light."""
 WITHOUT = "; without matter"
 """The same without its volume: a volume that predicts frames worse than none decides nothing."""
+
+Predict = Callable[[Light], Tensor]
+"""Frames [V, H, W] in even light, as the volume of those that were measured in some light has them."""
 
 Hypothesis = tuple[str, ...]
 """What is added to the null, in the order in which it was taken."""
@@ -132,7 +136,12 @@ class Trials:
             frames = self._first.folds.split(fold)[0].measured
             return plain_light(frames, self._options)
         before = self.tried(hypothesis[:-1], fold)
-        return with_more(before.light, hypothesis[-1], before.seen, before.predicted, self._options)
+
+        def predict(light: Light) -> Tensor:
+            same = light is before.light
+            return before.predicted if same else predictions(self._first.volume(fold, light), before.seen)
+
+        return with_more(before.light, hypothesis[-1], before.seen, predict, self._options)
 
     def _made(self, hypothesis: Hypothesis, fold: int) -> Trial:
         seen, unseen = self._first.folds.split(fold)
@@ -162,18 +171,22 @@ def plain_light(frames: Tensor, options: LightOptions) -> Light:
     return Light(air, NoiseModel.of_frames(frames, air), None)
 
 
-def with_more(light: Light, hypothesis: str, seen: Scan, predicted: Tensor, options: LightOptions) -> Light | None:
-    """`light` and what a hypothesis adds to it, by frames and their prediction [V, H, W] in even light; None where it
-    cannot be: a pattern of one frame, or light where none shows air. Smooth light is that of coarse pixels, on which it
-    is compared: on finer ones, what passes for air may be matter."""
+def with_more(light: Light, hypothesis: str, seen: Scan, predict: Predict, options: LightOptions) -> Light | None:
+    """`light` and what a hypothesis adds to it, by frames and what volumes predict of them in even light; None where it
+    cannot be: a pattern of one frame, or light where none shows air. The volume that tells flux from absorption is made
+    in light of unknown flux. Smooth light is that of coarse pixels, on which it is compared: on finer ones, what passes
+    for air may be matter."""
     frames = seen.measured
     if hypothesis == "fixed pattern":
-        return replace(light, still=fixed_pattern(light.evened(frames), predicted)) if len(seen) > 1 else None
+        return replace(light, still=fixed_pattern(light.evened(frames), predict(light))) if len(seen) > 1 else None
     if hypothesis == "correlated noise":
-        return replace(light, noise=NoiseModel.of_residuals(light.evened(frames), predicted))
+        return replace(light, noise=NoiseModel.of_residuals(light.evened(frames), predict(light)))
     if hypothesis == FLUX:
-        known = light.background is not None  # then it holds the flux
-        return None if known else replace(light, background=Background.of_flux(light.evened(frames), predicted))
+        if light.background is not None:
+            return None  # it holds the flux
+        even = light.evened(frames)
+        unknown = replace(light, background=Background.unknown_flux(even))
+        return replace(light, background=Background.of_flux(even, predict(unknown)))
     frames, factor = frames if light.still is None else (frames / light.still).float(), coarse_binning(seen)
     smooth = replace(binned_options(options, seen.views.shape, factor), kind="smooth")
     try:

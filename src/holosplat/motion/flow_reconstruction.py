@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..baselines.material import plateau
+from ..baselines.tomography import plateau
 from ..checks import as_written, at_least, positive, require
 from ..fit.flow_volume import FlowProblem, likelier_fading, likelier_flow
 from ..fit.smooth_volume import descend

@@ -228,6 +228,14 @@ class Background:
         return cls(flux[:, None] * level * (variance > 0), doubt, level * variance, powers, shape)
 
     @classmethod
+    def unknown_flux(cls, frames: Tensor) -> Background:
+        """Light of frames [V, H, W] that differs by a factor alone, before anything is known of their matter: all that
+        their means differ by may be flux."""
+        found = cls.of_flux(frames, torch.ones_like(frames))
+        doubt = torch.diag(found.variances).expand(len(frames), -1, -1)
+        return replace(found, coefficients=torch.zeros_like(found.coefficients), covariances=doubt)
+
+    @classmethod
     def handed(cls, known: DividedLight, shape: tuple[int, int]) -> Background:
         """What may be left of light that frames of `shape` (H, W) were divided by: no more, as far as is known."""
         size, corner = known.binning, known.corner
