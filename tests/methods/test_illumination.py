@@ -16,8 +16,8 @@ from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import SmoothVolume, Task
 from holosplat.methods.first_volumes import BY_FISSION, BY_VIEWS, FirstVolumes, Folds
 from holosplat.methods.illumination import STAGE, prepared
-from holosplat.methods.trials import UNEVEN, Trials, first_of_task, plain_light, with_more
-from holosplat.optics.background import Background, Light, LightOptions
+from holosplat.methods.trials import UNEVEN, WITHOUT, Trials, first_of_task, plain_light, with_more
+from holosplat.optics.background import FLUX, Background, Light, LightOptions
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.red_cells import random_cells
 from holosplat.specimens.scene import MeshScene
@@ -100,7 +100,7 @@ def test_light_is_applied_as_it_was_compared():
     frames = (light * skirt * (1 + 1e-3 * np.random.default_rng(3).normal(size=light.shape))).astype(np.float32)
     scan = Scan(frames, Exposures.of(Views.evenly_spaced(3, shape, PIXEL), 20.0, 0.1), np.zeros(3, dtype=bool))
     options = LightOptions()
-    found = with_more(plain_light(scan.measured, options), UNEVEN, scan, scan.measured, options)
+    found = with_more(plain_light(scan.measured, options), UNEVEN, scan, lambda _: scan.measured, options)
     compared = Light.of(scan.binned(3).measured, LightOptions("smooth"))
     assert found is not None
     assert torch.equal(found.part(torch.arange(3), 3).air, compared.air)
@@ -152,6 +152,30 @@ def test_flux_is_told_from_noise_of_means():
     assert 10 < sum(bool((one.factor() == 1).all()) for one in draws) < 30  # of equal flux, half of all draws
     assert bool((Background.of_flux(true, true).factor() == 1).all())
     assert bool((Background.of_flux(true[:1], 1.1 * true[:1]).factor() == 1).all())
+
+
+def test_flux_is_unknown_before_there_is_a_volume():
+    """All that means of frames differ by may be flux."""
+    draw = torch.Generator().manual_seed(2)
+    flux = torch.tensor([0.99, 1.0, 1.01, 1.02, 0.98])[:, None, None]
+    frames = flux * (1 + 0.01 * torch.randn(5, 31, 45, generator=draw))
+    found = Background.unknown_flux(frames)
+    assert found.is_flux
+    assert torch.equal(found.factor(), torch.ones(5, 31, 45, dtype=torch.float64))
+    assert found.size_of_doubt == pytest.approx(float(flux.log().std()), rel=0.1)
+
+
+def test_flux_is_told_where_it_spoils_the_volume(sharp):
+    """The volume of frames in even light predicts worse than no matter; that beside unknown flux predicts well."""
+    flux = 1 + 0.02 * np.random.default_rng(4).normal(size=(VIEWS, 1, 1))
+    trials = Trials(first_of_task(Task(lit(sharp, flux), PRIOR)), LightOptions())
+
+    def gain(name: str) -> float:
+        return trials.score(name, 0).gain_over(trials.score(name + WITHOUT, 0))[0]
+
+    assert trials.proposed((FLUX,))
+    assert gain("as measured") < 0
+    assert gain(FLUX) > 0.3
 
 
 @pytest.mark.parametrize("family", ["soft", "sharp"])

@@ -113,7 +113,8 @@ def tv_solver(
     """The solver of `total_variation` after its last iteration, for those who go on from there.
 
     Where there is no upper bound, the unit of the occupancy says nothing of the matter: the weight of total variation
-    is then per `level_of` the volume, found anew after every `LEVEL_STEPS`.
+    and the misfit's spectrum are then per `level_of` the volume, found anew after every `LEVEL_STEPS`; in the first of
+    them there is no total variation.
 
     weights: trust in each ray [V, H, W], above 0; with them, or with still light, frequencies are trusted alike to the
     end. Rays of missing pixels take the line integral of the volume, and so have no weight.
@@ -129,17 +130,18 @@ def tv_solver(
         solver.with_still_light(smooth_modes(rays.views.shape, options.still_light, like.device)[1:])
     alike = weights is not None or options.still_light > 0
     images, total = rays.projector.lines_out(rays.measured), options.first + options.iterations
-    gaps, measured, rms, level = rays.gaps(), images, 0.0, 1.0
+    gaps, measured, rms, level = rays.gaps(), images, 0.0, 0.0 if upper is None else 1.0
     for done in range(total):
         on_progress(done / total)
         images = solver.completed(measured, gaps)
+        if upper is None and done % LEVEL_STEPS == 0 and bool((solver.volume > 0).any()):
+            level = level_of(solver.volume)
         if done == options.first and options.discount > 0 and not alike:
-            solver.discount(misfit_spectrum(rays, solver.lines() - images) ** options.discount)
+            spectrum = misfit_spectrum(rays, solver.lines() - images) / (level or 1.0) ** 2
+            solver.discount(spectrum**options.discount)
         if done == options.first and options.misfit > 0:
             missing = images - solver.lines()
             rms = float((missing - solver.still_light(images)).square().mean().sqrt())
-        if upper is None and done % LEVEL_STEPS == 0 and bool((solver.volume > 0).any()):
-            level = level_of(solver.volume)
         solver.set_weight(max(options.weight * level, options.misfit * rms))
         solver.run(images, 1)
     return solver

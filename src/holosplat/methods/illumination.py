@@ -5,6 +5,7 @@ Each is carried as far as a volume, and taken only where this predicts unseen me
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 
@@ -16,45 +17,74 @@ from ..backends import resolve
 from ..baselines import HolographicTV, holographic_tv
 from ..checks import InputError, require
 from ..inference import Decision, Score, select
-from ..matter import MaterialPrior, Matter
+from ..matter import MaterialPrior, Matter, MatterKind
 from ..optics.background import FLUX, Light, LightOptions
 from ..progress import Progress
 from ..representations import VoxelGrid
 from ..scan import Scan
 from .assumed import assumed_material
+from .auto import Auto
 from .contrast import STAGE as SIGN
 from .contrast import Scoring, decide_sign, with_sign
 from .cross_validation import predicted_frames
 from .first_volumes import BY_FISSION, EFFORT, FirstVolumes
 from .levels import TrialFits
 from .method import Method, Task
-from .trials import UNEVEN, Hypothesis, Trials, first_of_task, name_of, named, plain_light, rivals, with_more
+from .trials import UNEVEN, WITHOUT, Hypothesis, Trials, first_of_task, name_of, named, plain_light, rivals, with_more
 from .volume import SmoothVolume
 
 STAGE = "light and noise"
+SHOWN = "matter in first volumes"
 HYPOTHESES = ("fixed pattern", FLUX, UNEVEN, "correlated noise")
 """What may be added to the null, in this order where several predict alike."""
 
 Prepared = tuple[Hypothesis, tuple[Decision, ...]]
 """What was taken, and the decisions that led to it."""
+Scored = Callable[[str, int], Score]
+"""The score of a hypothesis, by its name, in a fold."""
 
 
 def decided(
-    first: FirstVolumes, options: LightOptions, told: Hypothesis, hypotheses: tuple[str, ...]
-) -> tuple[Hypothesis, tuple[Decision, ...]]:
-    """The hypotheses that are added to what is told, one after another as long as one of the rest wins, and how."""
+    first: FirstVolumes,
+    options: LightOptions,
+    told: Hypothesis,
+    hypotheses: tuple[str, ...],
+    scored: Scored | None = None,
+) -> Prepared:
+    """The hypotheses that are added to what is told, one after another as long as one of the rest wins, and how.
+
+    scored: by what hypotheses are compared (default: by their first volumes).
+    """
     trials, taken, made = Trials(first, options), told, list[Decision]()
+    by = first.folds.by if scored is None else f"{first.folds.by}, by fits"
     if first.folds.by == BY_FISSION:  # of two views, a pattern is what volumes leave in both
         hypotheses = tuple(one for one in hypotheses if one != "fixed pattern")
     while left := [one for one in hypotheses if one not in taken and trials.proposed((*taken, one))]:
         null, names = name_of(taken), [name_of((*taken, one)) for one in left]
         beside = {name: rivals(taken, one) for name, one in zip(names, left)}
-        decision = select(STAGE, (null, *names), trials.score, first.folds.count, by=first.folds.by, beside=beside)
+        decision = select(STAGE, (null, *names), scored or trials.score, first.folds.count, by=by, beside=beside)
         made.append(decision)
         if decision.choice == null:
             break
         taken = named(decision.choice)
     return taken, tuple(made)
+
+
+def shows_matter(first: FirstVolumes, options: LightOptions, taken: Hypothesis) -> Decision:
+    """Whether the first volumes under a hypothesis predict unseen frames better than no matter would."""
+    trials, name = Trials(first, options), name_of(taken)
+    return select(SHOWN, (name + WITHOUT, name), trials.score, first.folds.count, by=first.folds.by)
+
+
+def by_fits(task: Task, first: FirstVolumes, kinds: Mapping[MatterKind, Method]) -> Scored:
+    """The score of a hypothesis by fits of coarse frames, for the kind of matter that predicts them better under it."""
+    fits = TrialFits(task, first, kinds)
+
+    def scored(name: str, fold: int) -> Score:
+        found = [fits.score(name, kind, fold) for kind in kinds]
+        return max(found, key=lambda each: each.gain_over(found[0])[0])
+
+    return scored
 
 
 def confirmed(task: Task, first: FirstVolumes, told: Hypothesis) -> Decision:
@@ -110,7 +140,12 @@ def prepared(task: Task, method: Method | None = None, before: Prepared | None =
     if before is None:
         task.on_progress(STAGE, 0.0)
         first.taken, made = decided(first, options, told, tuple(open_to))
-        if method is not None and first.taken != told and not method.of_series:
+        shown = None if method is None or method.of_series or not made else shows_matter(first, options, first.taken)
+        if isinstance(method, Auto) and shown is not None and shown.choice.endswith(WITHOUT):
+            scored = by_fits(task, first, method.with_effort(EFFORT).kinds)
+            first.taken, again = decided(first, options, told, tuple(open_to), scored)
+            made = (*made, shown, *again)
+        elif method is not None and first.taken != told and not method.of_series:
             decision = confirmed(task, first, told)
             first.taken, made = named(decision.choice), (*made, decision)
         if options.noise == "correlated":

@@ -15,7 +15,7 @@ from ..inference import Decision
 from ..io.provenance import sha256
 from ..methods import Task
 from ..methods.contrast import STAGE as SIGN
-from ..methods.illumination import STAGE, Prepared
+from ..methods.illumination import SHOWN, STAGE, Prepared
 from ..methods.presets import SCHEMA
 from ..methods.uncertain import Uncertain
 from ..optics.background import LightOptions
@@ -96,7 +96,7 @@ def decisions_of(task: Task) -> dict[str, Any]:
     """Entries of config.json that `decided_before` reads: what was decided of sign, light and noise, before the
     matter."""
     taken = () if task.first is None else task.first.taken
-    made = [each.as_dict() for each in task.decisions if each.name in (SIGN, STAGE)]
+    made = [each.as_dict() for each in task.decisions if each.name in (SIGN, STAGE, SHOWN)]
     return {"light": list(taken), "decisions": made}
 
 
