@@ -13,7 +13,8 @@ from torch import Tensor
 
 from ..checks import require
 from ..geometry import Poses, Views
-from ..optics.background import DARKEST, Background, posterior_covariance
+from ..optics.background import DARKEST, Background
+from ..optics.patterns import posterior_covariance
 from ..scan import Exposures
 from ..volume import Component, LineIntegrals, Object, TrainableObject
 from .alignment import Alignment

@@ -14,7 +14,7 @@ from ..divided_light import DividedLight
 from ..ranges import ranged
 from .air import Box, air_in_boxes, find_air, has_air
 from .noise_model import NoiseModel
-from .patterns import cosines, half_waves, smooth_modes
+from .patterns import cosines, half_waves, posterior, smooth_modes, sums
 
 ORDER = 8
 """Half waves across a frame up to which light changes."""
@@ -195,17 +195,17 @@ class Background:
         seen = air & (frames > DARKEST)
         values = torch.where(seen, frames.double(), 1.0).log().flatten(1)
         powers = torch.maximum(_lowest_power(noise), FINER**2 * _unevenness(values, seen.flatten(1)))
-        normal, right = _sums(values, seen.double().flatten(1), modes)
+        normal, right = sums(values, seen.double().flatten(1), modes)
         variances = torch.full((len(modes),), 1e-2, dtype=torch.float64)
         usable = has_air(air)
         count = torch.zeros(int(bands.max()) + 1, dtype=torch.float64).index_add(
             0, bands, torch.ones(len(modes)).double()
         )
         for _ in range(ROUNDS):
-            mean, covariance = _posterior(normal, right, variances, powers)
+            mean, covariance = posterior(normal, right, variances, powers)
             squares = (mean.square() + covariance.diagonal(dim1=1, dim2=2))[usable].mean(dim=0)
             variances = (torch.zeros_like(count).index_add(0, bands, squares) / count)[bands].clamp_min(1e-12)
-        mean, covariance = _posterior(normal, right, variances, powers)
+        mean, covariance = posterior(normal, right, variances, powers)
         return cls(mean, covariance, variances, powers, shape)
 
     @classmethod
@@ -306,8 +306,8 @@ class Background:
         seen = (measured > DARKEST) & (predicted > DARKEST)
         seen = seen if where is None else seen & where
         ratio = torch.where(seen, measured.double() / predicted.double().clamp_min(DARKEST), 1.0).log()
-        normal, right = _sums(ratio.flatten(1), seen.double().flatten(1), modes)
-        mean, covariance = _posterior(normal, right, self.variances, self.powers)
+        normal, right = sums(ratio.flatten(1), seen.double().flatten(1), modes)
+        mean, covariance = posterior(normal, right, self.variances, self.powers)
         return replace(self, coefficients=mean, covariances=covariance)
 
     def doubt(self, air: Tensor) -> Tensor:
@@ -338,7 +338,7 @@ def _surely_uneven(frames: Tensor, air: Tensor, noise: NoiseModel, usable: Tenso
     """The same of the frames that are usable [V] bool, some at least; noise counts by the modes' degrees of freedom."""
     lit, seen = frames[usable].double(), air[usable].double()
     modes = smooth_modes((frames.shape[1], frames.shape[2]), LOWEST).double().flatten(1)
-    normal, right = _sums((lit - 1).flatten(1), seen.flatten(1), modes)
+    normal, right = sums((lit - 1).flatten(1), seen.flatten(1), modes)
     ridge = 1e-6 * normal.diagonal(dim1=1, dim2=2).mean(dim=1)[:, None, None] * torch.eye(len(modes)).double()
     found = torch.linalg.solve(normal + ridge, right)
     power = _lowest_power(noise)[usable]
@@ -386,23 +386,3 @@ def _lowest_power(noise: NoiseModel) -> Tensor:
     """Power [V] of the noise at the lowest frequencies."""
     few = max(2, ORDER // 2)
     return noise.power()[:, : few + 1, : few + 1].mean(dim=(1, 2)).clamp_min(FAINTEST**2)
-
-
-def _sums(values: Tensor, seen: Tensor, modes: Tensor) -> tuple[Tensor, Tensor]:
-    """Of values [V, P], where they are seen [V, P], and modes [K, P]: their products [V, K, K] and [V, K]."""
-    normal = torch.stack([(modes * one) @ modes.T for one in seen])
-    return normal, (values.nan_to_num() * seen) @ modes.T
-
-
-def _posterior(normal: Tensor, right: Tensor, variances: Tensor, powers: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean [V, K] and covariance [V, K, K] of coefficients whose prior has `variances` [K]."""
-    covariance = posterior_covariance(normal, variances, powers)
-    return torch.einsum("vkl,vl->vk", covariance, right / powers[:, None]), covariance
-
-
-def posterior_covariance(normal: Tensor, variances: Tensor, powers: Tensor) -> Tensor:
-    """`(N/p + T⁻¹)⁻¹ = S (S N S/p + 1)⁻¹ S` [V, K, K], S² = T: of normal equations N [V, K, K], variances T [K] and
-    noise of power p [V]; so it is exact for any T."""
-    scale = variances.sqrt()
-    inner = normal * scale[:, None] * scale / powers[:, None, None] + torch.eye(len(scale), dtype=torch.float64)
-    return torch.linalg.inv(inner) * scale[:, None] * scale

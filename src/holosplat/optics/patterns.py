@@ -1,4 +1,4 @@
-"""Patterns of light: smooth modes, and the fixed pattern that all frames have in common beside their matter."""
+"""Patterns of light: smooth modes, their coefficients, and the fixed pattern that frames have beside their matter."""
 
 from __future__ import annotations
 
@@ -65,3 +65,23 @@ def mean_light(frames: Tensor, predicted: Tensor, order: int) -> Tensor:
 
 def _logarithms(frames: Tensor) -> Tensor:
     return frames.double().clamp_min(DARKEST).log()
+
+
+def sums(values: Tensor, seen: Tensor, modes: Tensor) -> tuple[Tensor, Tensor]:
+    """Of values [V, P], where they are seen [V, P], and modes [K, P]: their products [V, K, K] and [V, K]."""
+    normal = torch.stack([(modes * one) @ modes.T for one in seen])
+    return normal, (values.nan_to_num() * seen) @ modes.T
+
+
+def posterior(normal: Tensor, right: Tensor, variances: Tensor, powers: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean [V, K] and covariance [V, K, K] of coefficients whose prior has `variances` [K]."""
+    covariance = posterior_covariance(normal, variances, powers)
+    return torch.einsum("vkl,vl->vk", covariance, right / powers[:, None]), covariance
+
+
+def posterior_covariance(normal: Tensor, variances: Tensor, powers: Tensor) -> Tensor:
+    """`(N/p + T⁻¹)⁻¹ = S (S N S/p + 1)⁻¹ S` [V, K, K], S² = T: of normal equations N [V, K, K], variances T [K] and
+    noise of power p [V]; so it is exact for any T."""
+    scale = variances.sqrt()
+    inner = normal * scale[:, None] * scale / powers[:, None, None] + torch.eye(len(scale), dtype=torch.float64)
+    return torch.linalg.inv(inner) * scale[:, None] * scale
