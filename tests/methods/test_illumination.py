@@ -12,10 +12,11 @@ from holosplat.baselines import holographic_tv
 from holosplat.beamline.light import UnevenLight, correlated_field
 from holosplat.beamline.simulate import simulate
 from holosplat.geometry import Views
+from holosplat.inference import Score
 from holosplat.matter import DeltaBeta, MaterialPrior
-from holosplat.methods import SmoothVolume, Task
+from holosplat.methods import Auto, SmoothVolume, Task
 from holosplat.methods.first_volumes import BY_FISSION, BY_VIEWS, FirstVolumes, Folds
-from holosplat.methods.illumination import STAGE, prepared
+from holosplat.methods.illumination import SHOWN, STAGE, prepared, shows_matter
 from holosplat.methods.trials import UNEVEN, WITHOUT, Trials, first_of_task, plain_light, with_more
 from holosplat.optics.background import FLUX, Background, Light, LightOptions
 from holosplat.scan import Exposures, Scan
@@ -237,3 +238,32 @@ def test_the_lamp_of_a_simulated_beamline_is_found(sharp):
     rng = np.random.default_rng(0)
     frames = np.stack([lamp.recorded(frame, n, 1e5, rng) for n, frame in enumerate(sharp.frames)])
     assert "uneven light" in " ".join(choices(replace(sharp, frames=frames.astype(np.float32))))
+
+
+def test_fits_decide_where_first_volumes_show_no_matter(sharp, monkeypatch):
+    """By the kind of matter that predicts better; they are not asked where first volumes show some."""
+    asked = set()
+
+    class Fits:
+        def __init__(self, *_: object) -> None: ...
+
+        def score(self, name: str, kind: str, fold: int) -> Score:
+            asked.add(kind)
+            left = 0.5 if (name, kind) == (FLUX, "levels") else 1.0
+            return Score(left * np.random.default_rng(fold).uniform(1, 2, (4, 3)), 2)
+
+    monkeypatch.setattr("holosplat.methods.illumination.TrialFits", Fits)
+    noise = 1 + 0.01 * np.random.default_rng(6).normal(size=sharp.frames.shape)
+    flux = 1 + 0.02 * np.random.default_rng(4).normal(size=(VIEWS, 1, 1))
+    empty = replace(sharp, frames=(noise * uneven() * flux).astype(np.float32))
+    options = LightOptions(still="none", noise="white")
+    made = prepared(Task(empty, PRIOR, light=options), Auto()).decisions
+    assert all(each.choice.endswith("without matter") for each in made if each.name == SHOWN)
+    last = [each for each in made if each.name == STAGE and each.by.endswith("by fits")]
+    assert [each.choice for each in last] == [FLUX, FLUX]
+    assert asked == {"levels", "continuous"}
+
+
+def test_first_volumes_decide_where_they_show_matter(sharp):
+    first = first_of_task(Task(sharp, PRIOR))
+    assert shows_matter(first, LightOptions(), ()).choice == "as measured"
