@@ -37,8 +37,8 @@ def resumed(arguments: Sequence[str]) -> list[str]:
 
 
 def is_made_by(path: Path, words: Sequence[str]) -> bool:
-    """Whether the file or folder `path` says that the command with these `words` made it, what is in it, from inputs
-    which are what they were; of arguments that are too many files to be named one by one, this is not known, and taken to be so."""
+    """Whether the file or folder `path` says that the command with these `words` made it, as it is, from inputs which
+    are what they were; of arguments that are too many files to be named one by one, this is taken to be so."""
     record = origin(path)
     with suppress(InputError), as_written(path):
         said, folder = shlex.split(record["command"])[1:], Path(from_home(record["folder"]))
