@@ -101,6 +101,17 @@ def test_a_stage_that_was_killed_as_it_began_begins_again(place, record):
         refused(piped(text), "must have one writer")
 
 
+def test_a_run_that_was_killed_before_its_report_goes_on(place):
+    """Its result is whole, but the lock of its process is there still."""
+    text = CUT_SHORT[: CUT_SHORT.index("[export]")]
+    worked(piped(text))
+    Path("run/report.html").unlink()
+    Path("run/.lock").write_text(json.dumps({"host": socket.gethostname(), "process": 2**22 + 1}))
+    assert done(worked(piped(text)).err) == []
+    assert Path("run/report.html").is_file()
+    assert done(worked(piped(text)).err) == ["reconstruct"]
+
+
 def test_a_file_is_not_there_without_its_record(place, monkeypatch):
     """Nor is one that is as another command left it taken for the own."""
     worked(piped(CUT_SHORT.replace("volume.h5", "volume.vti")))

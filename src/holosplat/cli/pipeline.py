@@ -17,6 +17,7 @@ from tyro.conf import Positional, arg
 
 from ..checks import InputError, require
 from ..io.folder import is_taken
+from ..io.lock import writer_of
 from ..io.provenance import is_hdf5
 from ..ranges import checked_later, with_checked_numbers
 from ..tables import read_table, shown
@@ -76,7 +77,13 @@ class Stage:
 
         if is_run(out.path):
             run = RunFolder(out.path)
-            return run.summary.is_file() and run.read_summary().get("finished") is True and not check(out.path)[1]
+            ended = writer_of(out.path) is None  # a process that was killed leaves its lock, and no report
+            return (
+                ended
+                and run.summary.is_file()
+                and run.read_summary().get("finished") is True
+                and not check(out.path)[1]
+            )
         if self._can_resume:  # it finds out itself what is left
             return False
         whole = out.is_there() or self.name != "export"
