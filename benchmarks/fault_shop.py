@@ -143,7 +143,7 @@ class Shop:
 
 @dataclass(frozen=True)
 class Writer:
-    """A command that writes `out` in a folder. again: what the command needs where `out` is begun, that is, has one of
+    """A command that writes `out` in a folder. again: what the command needs, as it says, where `out` is begun, that is, has one of
     the files `begun`, or in any case where there are none; goes_on: whether the command goes on with what is there as
     it is; alone: the command that goes on with `out`, where it is another one."""
 
@@ -277,11 +277,14 @@ WRITERS = (
             *("plan", "--mesh", shop.cells[0], "--energy-range", 10, 20, *MATERIAL, "--out", folder / "out.png")
         ],
         "out.png",
+        ("--force",),
+        (),
     ),
     Writer(
         "forecast",
         lambda shop, folder: ["forecast", shop.track, "--out", folder / "out", "--times", 1, "--no-half-sets"],
         "out",
+        ("--force",),
     ),
     Writer("dataset", lambda shop, folder: ["dataset", "--out", folder / "out", *SCENES], "out", goes_on=True),
     Writer(
