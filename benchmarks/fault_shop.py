@@ -143,7 +143,7 @@ class Shop:
 
 @dataclass(frozen=True)
 class Writer:
-    """A command that writes `out` in a folder. again: what the command needs, as it says, where `out` is begun, that is, has one of
+    """A command that writes `out` in a folder. again: what the command needs where `out` is begun, that is, has one of
     the files `begun`, or in any case where there are none; goes_on: whether the command goes on with what is there as
     it is; alone: the command that goes on with `out`, where it is another one."""
 
