@@ -204,17 +204,24 @@ def two(shop: Shop, rng: random.Random, folder: Path) -> str:
     """A second run into the folder of one that goes on is refused, and the first is as without it."""
     child = os.fork()
     if child == 0:
-        run(shop.reconstruct(folder / "out"))
-        os._exit(0)
-    deadline = time.perf_counter() + 60
-    while not (folder / "out" / ".lock").exists() and time.perf_counter() < deadline:
+        first = run(shop.reconstruct(folder / "out"), limit=LONG)
+        os._exit(ENDS.index(first.verdict or ("" if first.code == 0 else "lost")))
+    while not (folder / "out" / ".lock").exists():
+        if os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None:
+            break
         time.sleep(0.01)
-    second = run(shop.reconstruct(folder / "out"))
-    os.waitpid(child, 0)
-    if sentence(second) or second.code == 0:
-        return sentence(second) or "silent"
+    second = run(shop.reconstruct(folder / "out"), limit=LONG)
+    first = ENDS[os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])]
+    if first or sentence(second) or second.code == 0:
+        return first or sentence(second) or "silent"
     same = read_object(folder / "out/object.h5").state(), read_object(shop.run / "object.h5").state()
     return "" if is_whole(folder / "out") and all(map(_alike, same[0].values(), same[1].values())) else "lost"
+
+
+LONG = 600.0
+"""Seconds from which on a run hangs beside another one, under any load."""
+ENDS = ("", "lost", "traceback", "hang", "crash")
+"""How the first one ends."""
 
 
 def _alike(one: Any, other: Any) -> bool:

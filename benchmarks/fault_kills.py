@@ -2,28 +2,36 @@
 
 from __future__ import annotations
 
+import os
 import random
 import re
+import signal
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from fault_cost import Cost
 from fault_shop import Shop, Writer, hidden_in, is_whole, reads, snapshots
-from forked import Ended, run
+from forked import Ended, at_events, run
 
 BLOCK = 4096
 """Bytes of a page, by which a file system in memory grows."""
-HANG, SLOWER = 60.0, 10
-"""A command hangs that takes more seconds than this, and so many times what it takes undisturbed under the same load.
-"""
 
 
-def killed(shop: Shop, writer: Writer, seconds: float, rng: random.Random, folder: Path) -> str:
-    """Kill a command at a random moment of its `seconds`, and let the next one follow; what went wrong."""
-    command = writer.command(shop, folder)
-    limit = max(HANG, SLOWER * seconds)
-    first = run(command, kill_after=rng.uniform(0.0, 1.1 * seconds), limit=limit)
+def _die() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def killed(shop: Shop, writer: Writer, cost: Cost, rng: random.Random, folder: Path) -> str:
+    """Kill a command, and let the next one follow; what went wrong. By turns at a random moment, and before a random
+    change of files, between which most moments are alike."""
+    command, limit = writer.command(shop, folder), cost.limit
+    if cost.changes and rng.random() < 0.5:
+        last = rng.randrange(cost.changes) + 1
+        first = run(command, limit=limit, first=lambda: at_events(folder, lambda n: _die() if n == last else None))
+    else:
+        first = run(command, kill_after=rng.uniform(0.0, 1.1 * cost.seconds), limit=limit)
     if first.verdict:
         return first.verdict
     out = folder / writer.out
@@ -45,9 +53,10 @@ def killed(shop: Shop, writer: Writer, seconds: float, rng: random.Random, folde
     return "" if is_whole(out) else "lost"
 
 
-def full(shop: Shop, writer: Writer, largest: int, rng: random.Random, folder: Path) -> str:
+def full(shop: Shop, writer: Writer, cost: Cost, rng: random.Random, folder: Path) -> str:
     """No room for all of it: one sentence, and what is there is whole. By turns no file grows beyond a random size, and
     a file system in memory is full, where one can be mounted (as root)."""
+    largest = cost.largest
     if rng.random() < 0.5:
         ended = run(writer.command(shop, folder), file_size=rng.randrange(largest + 1))
         return _judged(ended, folder / writer.out)

@@ -277,11 +277,14 @@ WRITERS = (
             *("plan", "--mesh", shop.cells[0], "--energy-range", 10, 20, *MATERIAL, "--out", folder / "out.png")
         ],
         "out.png",
+        ("--force",),
+        (),
     ),
     Writer(
         "forecast",
         lambda shop, folder: ["forecast", shop.track, "--out", folder / "out", "--times", 1, "--no-half-sets"],
         "out",
+        ("--force",),
     ),
     Writer("dataset", lambda shop, folder: ["dataset", "--out", folder / "out", *SCENES], "out", goes_on=True),
     Writer(

@@ -6,7 +6,7 @@ Each trial is one command (or two: the next one), counted as a traceback, a hang
 killed, ten times what it takes undisturbed), a crash (a signal that nobody sent), a wrong result taken silently, a file
 torn (half of it is left), something lost (a file that was whole before and is no more, or a folder that no next command
 takes), or values of another file let in without leave. Trials are drawn from the seed, and repeat with it but for
-moments of a kill.
+moments of a kill by time; by turns a kill is before a change of files, whose number is drawn.
 """
 
 from __future__ import annotations
@@ -24,13 +24,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 import machine
+from fault_cost import Cost
 from fault_files import flipped, hostile, odd, tampered, two
 from fault_formats import formats, records
 from fault_kills import full, killed
 from fault_limits import denied, extreme, starved
 from fault_places import foreign, outputs
 from fault_shop import LOOKERS, WRITERS, Shop, Writer
-from forked import loaded, run, size_of
+from forked import loaded
 from rows import read, write
 
 OUTCOMES = ("traceback", "hang", "crash", "silent", "torn", "lost", "let in")
@@ -53,15 +54,6 @@ LIMITED: dict[str, Callable[[Shop, Writer, random.Random, Path], str]] = {
 }
 
 
-def timed(shop: Shop, writer: Writer) -> tuple[float, int]:
-    """Seconds that a command takes, and bytes of the largest file that it writes."""
-    with tempfile.TemporaryDirectory() as name:
-        ended = run(writer.command(shop, Path(name)), limit=600)
-        if ended.code != 0:
-            raise SystemExit(f"{writer.name} must work before it is disturbed, but: {ended.said}")
-        return ended.seconds, size_of(Path(name) / writer.out)
-
-
 def trials(
     shop: Shop, kind: str, count: int, rng: random.Random, writers: tuple[Writer, ...] = WRITERS, seconds: float = 1e9
 ) -> Counter:
@@ -80,10 +72,8 @@ def trials(
             elif kind in LIMITED:
                 outcome = LIMITED[kind](shop, writer, rng, folder)
             else:
-                cost[writer.name] = cost.get(writer.name) or timed(shop, writer)
-                lasts, largest = cost[writer.name]
-                act, measure = (full, largest) if kind == "full disk" else (killed, lasts)
-                outcome = act(shop, writer, measure, rng, folder)
+                cost[writer.name] = cost.get(writer.name) or Cost.of(shop, writer)
+                outcome = (full if kind == "full disk" else killed)(shop, writer, cost[writer.name], rng, folder)
         found.update(["trials", *([outcome] if outcome else [])])
         if outcome:
             print(f"{kind} {number} ({writer.name}): {outcome}", file=sys.stderr, flush=True)

@@ -40,6 +40,26 @@ def nothing() -> None:
     """What a command does first, unless it is told otherwise."""
 
 
+EVENTS = ("open", "os.link", "os.mkdir", "os.remove", "os.rename", "os.rmdir", "os.truncate")
+"""What Python says before it changes files (PEP 578)."""
+
+
+def at_events(folder: Path, act: Callable[[int], None]) -> None:
+    """From now on `act` with the number of each event, from 1 on, before this process changes files in `folder`."""
+    count, within = 0, os.fspath(folder)
+
+    def heard(event: str, arguments: tuple[Any, ...]) -> None:
+        nonlocal count
+        if event not in EVENTS or not isinstance(arguments[0], str | bytes | os.PathLike):
+            return
+        reads = event == "open" and not (isinstance(arguments[2], int) and arguments[2] & (os.O_WRONLY | os.O_RDWR))
+        if not reads and within in os.fsdecode(arguments[0]):
+            count += 1
+            act(count)
+
+    sys.addaudithook(heard)
+
+
 def run(
     arguments: list[object],
     kill_after: float = 0.0,

@@ -5,9 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import KDTree
 
 from .checks import InputError, finite, shaped
 
@@ -50,9 +47,9 @@ class TriangleMesh:
         Triangles left with a repeated vertex are dropped; the order of the vertices that stay is kept.
         """
         if tolerance > 0:
-            pairs = KDTree(self.vertices).query_pairs(tolerance, output_type="ndarray")
-            graph = coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(len(self.vertices),) * 2)
-            _, group = connected_components(graph, directed=False)
+            from scipy.spatial import KDTree  # which takes longer to load than meshes to read
+
+            group = _connected(KDTree(self.vertices).query_pairs(tolerance, output_type="ndarray"), len(self.vertices))
         else:
             _, group = np.unique(self.vertices, axis=0, return_inverse=True)
         _, first, group = np.unique(group.reshape(-1), return_index=True, return_inverse=True)
@@ -71,10 +68,17 @@ class TriangleMesh:
 
 def shell_labels(faces: np.ndarray, vertex_count: int) -> np.ndarray:
     """[F] the number, from 0 on, of the connected shell that each of `faces` [F, 3] belongs to."""
-    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
-    graph = coo_array((np.ones(len(ends)), tuple(ends.T)), shape=(vertex_count,) * 2)
-    _, group = connected_components(graph, directed=False)
+    group = _connected(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]]), vertex_count)
     return np.unique(group[faces[:, 0]], return_inverse=True)[1].reshape(-1)
+
+
+def _connected(pairs: np.ndarray, count: int) -> np.ndarray:
+    """[count] the number of the group that each vertex belongs to, where `pairs` [E, 2] belong together."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    graph = coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(count, count))
+    return connected_components(graph, directed=False)[1]
 
 
 def winding_number(triangles: np.ndarray, point: np.ndarray) -> float:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import json
+import os
 import re
 import shutil
+import socket
 import tomllib
 from pathlib import Path
 
@@ -77,6 +80,60 @@ def test_what_is_missing_or_cut_off_is_done_again(place):
     assert "[reconstruct] holosplat reconstruct scan.nxs --out run" in again.err
     assert "--config quick.json --resume" in again.err
     assert done(worked(piped(CUT_SHORT, "--redo")).err)[:1] == ["reconstruct"]
+
+
+@pytest.mark.parametrize("record", [False, True])
+def test_a_stage_that_was_killed_as_it_began_begins_again(place, record):
+    """All it left is a folder, its lock, and the record of other words."""
+    Path("run").mkdir()
+    Path("run/.lock").write_text(
+        "{}" if not record else json.dumps({"host": socket.gethostname(), "process": 2**22 + 1})
+    )
+    if record:
+        Path("run/provenance.json").write_text(
+            json.dumps({"records": [{"command": "holosplat reconstruct other.nxs"}]})
+        )
+    text = CUT_SHORT[: CUT_SHORT.index("[export]")]
+    if record:
+        worked(piped(text))
+        assert [one["command"].split()[2] for one in records(Path("run"))] == ["scan.nxs"]
+    else:
+        refused(piped(text), "must have one writer")
+
+
+def test_a_run_that_was_killed_before_its_report_goes_on(place):
+    """Its result is whole, but the lock of its process is there still."""
+    text = CUT_SHORT[: CUT_SHORT.index("[export]")]
+    worked(piped(text))
+    Path("run/report.html").unlink()
+    Path("run/.lock").write_text(json.dumps({"host": socket.gethostname(), "process": 2**22 + 1}))
+    assert done(worked(piped(text)).err) == []
+    assert Path("run/report.html").is_file()
+    assert done(worked(piped(text)).err) == ["reconstruct"]
+
+
+def test_a_file_is_not_there_without_its_record(place, monkeypatch):
+    """Nor is one that is as another command left it taken for the own."""
+    worked(piped(CUT_SHORT.replace("volume.h5", "volume.vti")))
+    made = Path("volume.vti").read_bytes()
+    record = Path("volume.vti.provenance.json").read_bytes()
+
+    def killed(one: Path, other: Path) -> None:
+        if other.name == "volume.vti":
+            raise KeyboardInterrupt
+        os.rename(one, other)
+
+    Path("volume.vti").unlink()
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", killed)
+        assert holosplat("run", "run.toml").code == 130
+    assert not Path("volume.vti").exists()
+    assert Path("volume.vti.provenance.json").is_file()
+    assert done(worked(holosplat("run", "run.toml")).err) == ["reconstruct"]
+    assert Path("volume.vti").read_bytes() == made
+    Path("volume.vti").write_bytes(made + b" ")
+    Path("volume.vti.provenance.json").write_bytes(record)
+    refused(holosplat("run", "run.toml"), "[export] must not replace volume.vti")
 
 
 def test_other_options_replace_nothing_without_being_told(place):

@@ -13,6 +13,8 @@ from pathlib import Path
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 EXCUSE = re.compile(r"# (?:needs (?:network|a browser|a cluster|files of yours)|takes (?:minutes|hours|days))\b")
 """How a block begins, for the reader to see, that is not run but only parsed."""
+FAR = re.compile(r"# needs (?:network|a browser|a cluster)\b")
+"""How a block begins of these that no test can run."""
 GIVEN = re.compile(
     r"((?:`[\w.]+`(?:,\s+|\s+and\s+)?)+)\s+(?:is|are)\s+made\s+"
     r"\[in\s+the\s+README\]\([./]*README\.md#your-own-cells\)"
@@ -50,9 +52,15 @@ def run(page: str, folder: Path, readme: Path | None = None) -> None:
         shutil.copy(readme / name, folder)
     for block in blocks(page):
         if block.runs:
-            words = ["bash", "-euo", "pipefail", "-c"] if block.language == "sh" else [sys.executable, "-c"]
-            done = subprocess.run([*words, block.text], cwd=folder, env=_environment(), capture_output=True, text=True)
-            assert done.returncode == 0, f"{block.text}\n{done.stdout[-2000:]}\n{done.stderr[-4000:]}"
+            run_block(block, folder)
+
+
+def run_block(block: Block, folder: Path, shell: Path | None = None) -> None:
+    """Run a block in a folder; one that fails ends it with what it said. shell: a file that a shell reads before."""
+    words = ["bash", "-euo", "pipefail", "-c"] if block.language == "sh" else [sys.executable, "-c"]
+    env = _environment() | ({"BASH_ENV": str(shell)} if shell else {})
+    done = subprocess.run([*words, block.text], cwd=folder, env=env, capture_output=True, text=True)
+    assert done.returncode == 0, f"{block.text}\n{done.stdout[-2000:]}\n{done.stderr[-4000:]}"
 
 
 def _environment() -> dict[str, str]:

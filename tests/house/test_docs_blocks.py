@@ -2,8 +2,9 @@
 
 Blocks of the lab notebook (docs/notebook) are parsed only: they show how numbers were made.
 
-A block that begins with a comment such as `# needs network` or `# takes hours` (`helpers.doc_blocks.EXCUSE`) is only
-parsed; tests/house/test_docs_commands.py holds the options of its commands to the command line.
+A block that begins with a comment such as `# needs network` or `# takes hours` (`helpers.doc_blocks.EXCUSE`) does not
+run as it stands; tests/house/test_docs_commands.py holds the options of its commands to the command line. Most of these
+run at a small size (`helpers.doc_small`).
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ from pathlib import Path
 
 import pytest
 
-from helpers.doc_blocks import Block, blocks, given, misparsed, run
+from helpers.doc_blocks import FAR, Block, blocks, given, misparsed, run, run_block
+from helpers.doc_small import PAGES as PAGES_SMALL
 from holosplat.methods.presets import read_method
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -54,6 +56,20 @@ def test_the_blocks_of_a_page_run(page, readme, tmp_path):
     run(TEXTS[page], tmp_path, readme)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PAGES_SMALL)
+def test_blocks_that_take_long_run_at_a_small_size(name, tmp_path):
+    """With files that stand in for the reader's, and fewer pixels, views and steps."""
+    small = PAGES_SMALL[name]
+    shell = tmp_path / ".small.sh"
+    shell.write_text(small.shell(), encoding="utf-8")
+    run_block(Block("sh", small.before), tmp_path)
+    found = [block for block in blocks(TEXTS[README if name == "README.md" else DOCS / name]) if small.takes(block)]
+    assert found
+    for block in found:
+        run_block(block, tmp_path, shell)
+
+
 @pytest.mark.parametrize("page", WITH_BLOCKS, ids=name_of)
 def test_blocks_are_well_formed(page):
     """Their language is one that is run, parsed here, or output; shell and Python take their syntax."""
@@ -76,6 +92,19 @@ def test_settings_files_are_read(tmp_path):
 def test_there_are_pages_that_run():
     assert len(RUN) >= 8
     assert any(block.runs for block in blocks(TEXTS[README]))
+
+
+def test_few_blocks_of_the_guide_run_nowhere():
+    """Beside those that need a network or a cluster."""
+    left = []
+    for page in [page for page in WITH_BLOCKS if page.parent != NOTEBOOK]:
+        small = PAGES_SMALL.get("README.md" if page == README else page.relative_to(DOCS).as_posix())
+        for block in blocks(TEXTS[page]):
+            far = block.language in ("", "toml") or FAR.match(block.text)
+            left += [] if block.runs or far or (small and small.takes(block)) else [name_of(page)]
+    moving = ["docs/moving_matter.md"] * 2
+    first = ["docs/alignment.md", "docs/command_line.md", "docs/forecast.md", "docs/howto/which_matter.md"]
+    assert left == [*first, *moving, "docs/simulation.md"]
 
 
 def test_what_fails_is_seen(tmp_path):

@@ -40,7 +40,7 @@ def shop(faults, tmp_path_factory):
         patch.setattr(Figure, "savefig", Figure.savefig)  # which is put back in the end
         faults.loaded()
         for command in (made.simulate(made.scan), made.reconstruct(made.run)):
-            assert faults.run(command).code == 0
+            assert importlib.import_module("forked").run(command).code == 0
         yield made
 
 
@@ -104,7 +104,10 @@ def test_memory_that_does_not_do_ends_in_a_sentence(faults, shop, tmp_path):
     """Not even for the libraries; and for these alone, where it may do in what earlier tests have given back."""
     limits, kills = (importlib.import_module(name) for name in ("fault_limits", "fault_kills"))
     command = writer(faults, "convert").command(shop, tmp_path)
-    never, after = limits._anew(command, 200 << 20), faults.run(command, first=lambda: limits.limited(1 << 20))
+    never, after = (
+        limits._anew(command, 200 << 20),
+        importlib.import_module("forked").run(command, first=lambda: limits.limited(1 << 20)),
+    )
     assert never.code == 2
     for ended in (never, after):
         assert kills.sentence(ended) == "", ended.said
@@ -138,6 +141,43 @@ def test_a_file_that_is_lost_is_counted(faults, shop, monkeypatch):
 
     monkeypatch.setattr(importlib.import_module("fault_kills"), "run", in_place)
     assert faults.trials(shop, "kill -9", 1, random.Random(1), (writer(faults, "convert"),)) == {"trials": 1, "lost": 1}
+
+
+class Drawn:
+    """In place of random numbers: a kill before the change of files `number`, from 0 on."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+
+    def random(self) -> float:
+        return 0.0
+
+    def randrange(self, stop: int) -> int:
+        assert self.number < stop
+        return self.number
+
+
+def test_nothing_is_lost_before_any_change_of_files(faults, shop, tmp_path):
+    """A volume and its record are whole or none, and no half-written one stays once the command is given again."""
+    kills, export = importlib.import_module("fault_kills"), writer(faults, "export .vti")
+    cost = importlib.import_module("fault_cost").Cost.of(shop, export)
+    assert cost.changes >= 4  # a volume and its record, each written and put in its place
+    for number in range(cost.changes):
+        (tmp_path / f"{number}").mkdir()
+        assert kills.killed(shop, export, cost, Drawn(number), tmp_path / f"{number}") == ""
+
+
+def test_a_kill_comes_before_the_change_that_is_drawn(faults, tmp_path):
+    """The file that is begun then is not there, the one before it is."""
+    forked = importlib.import_module("forked")
+
+    def act() -> None:
+        forked.at_events(tmp_path, lambda number: signal.raise_signal(signal.SIGKILL) if number == 2 else None)
+        for name in ("one", "two"):
+            (tmp_path / name).write_text((BENCHMARKS / "faults.py").read_text())
+
+    assert forked.attempted(act).signal == signal.SIGKILL
+    assert [path.name for path in tmp_path.iterdir()] == ["one"]
 
 
 @pytest.mark.parametrize(

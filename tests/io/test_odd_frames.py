@@ -52,6 +52,23 @@ def test_flats_and_darks_unlike_the_others_are_left_out_and_named(tmp_path, capl
     np.testing.assert_allclose(scan.frames, (FRAMES - 10.0) / level, atol=3e-3)
 
 
+@pytest.mark.parametrize(
+    ("flat", "dark", "said"),
+    [
+        (0.1, 0.1005, []),
+        (0.1, 1.0, ["darks were exposed 1 s, but projections 0.1 s"]),
+        (0.2, 0.1, ["flats were exposed 0.2 s, but projections 0.1 s"]),
+    ],
+)
+def test_flats_and_darks_of_another_time_are_warned_of(tmp_path, caplog, flat, dark, said):
+    path = raw_file(tmp_path / "raw.nxs", FLATS, DARKS)
+    with h5py.File(path, "r+") as file:
+        file["entry/instrument/detector/count_time"] = np.r_[np.full(4, flat), np.full(4, dark), np.full(N, 0.1)]
+    read_scan(path)
+    assert len(caplog.records) == len(said)
+    assert all(words in caplog.text for words in said)
+
+
 def test_frames_are_left_out_by_number(tmp_path, caplog):
     darks = np.where(np.arange(4)[:, None, None] == 2, 510, DARKS)
     path = raw_file(tmp_path / "raw.nxs", FLATS, darks)

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from helpers.browser import needs_chromium, opened
 from helpers.report_page import PITCH, Page, content, scene
 from holosplat.geometry import Views
 from holosplat.metrics import robust_material_delta, volume_scores
@@ -20,6 +21,23 @@ from holosplat.report.tables import duration, headline, percent
 from holosplat.units import wavelength
 from holosplat.volume import Volume
 from holosplat.workflows.verdict import Verdict
+
+# --- the figures over the report ---
+
+
+@needs_chromium
+def test_no_figure_of_a_narrow_page_reaches_into_another(undrawn_reports, tmp_path):
+    """On a phone's 420 pixels, a long one included."""
+    script = """<style>body { width: 420px; }</style><script>
+        const box = (one) => { const range = document.createRange(); range.selectNodeContents(one); return range; };
+        document.title = [...document.querySelectorAll(".key div")].every((one) =>
+            box(one).getBoundingClientRect().right <= one.getBoundingClientRect().right
+            && one.getBoundingClientRect().right <= 420) ? "fits" : "overflows";</script>"""
+    page = tmp_path / "page.html"
+    text = render_page(content()).replace("42.5 dB", "1.28 × 10⁻²⁰ m³")
+    page.write_text(text.replace("</body>", f"{script}</body>"), encoding="utf-8")
+    assert "<title>fits</title>" in opened(page)[0]
+
 
 # --- the verdict ---
 

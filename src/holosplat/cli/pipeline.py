@@ -16,6 +16,8 @@ import tyro
 from tyro.conf import Positional, arg
 
 from ..checks import InputError, require
+from ..io.folder import is_taken
+from ..io.lock import writer_of
 from ..io.provenance import is_hdf5
 from ..ranges import checked_later, with_checked_numbers
 from ..tables import read_table, shown
@@ -60,7 +62,7 @@ class Stage:
     def state(self) -> str:
         """new: no output is there; done: all are, whole, and made by this command from the same input; begun: some are,
         or not whole; other: another command or input made one of them."""
-        there = [path for out in self.outputs() for path in ([out.path] if out.is_there() else of_times(out.path))]
+        there = [path for out in self.outputs() for path in ([out.path] if _is_taken(out) else of_times(out.path))]
         if not there:
             return "new"
         if not all(is_made_by(path, self.words) for path in there):
@@ -75,7 +77,13 @@ class Stage:
 
         if is_run(out.path):
             run = RunFolder(out.path)
-            return run.summary.is_file() and run.read_summary().get("finished") is True and not check(out.path)[1]
+            ended = writer_of(out.path) is None  # a process that was killed leaves its lock, and no report
+            return (
+                ended
+                and run.summary.is_file()
+                and run.read_summary().get("finished") is True
+                and not check(out.path)[1]
+            )
         if self._can_resume:  # it finds out itself what is left
             return False
         whole = out.is_there() or self.name != "export"
@@ -106,6 +114,10 @@ class Stage:
         given.arguments |= more
         with _typed(words):
             self.function(*given.args, **given.kwargs)
+
+
+def _is_taken(out: Place) -> bool:
+    return out.is_there() and is_taken(out.path)
 
 
 def _is_damaged(path: Path) -> bool:

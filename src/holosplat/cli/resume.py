@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..checks import InputError, as_written, require
-from ..io.provenance import NAME, fingerprint, from_home, origin, records
+from ..io.provenance import MADE, NAME, fingerprint, from_home, origin, records
 
 AGAIN = "give the scan, the options and --out again, with --resume"
 OF_ONE_CALL = ("--log", "--force", "--resume")
@@ -37,15 +37,16 @@ def resumed(arguments: Sequence[str]) -> list[str]:
 
 
 def is_made_by(path: Path, words: Sequence[str]) -> bool:
-    """Whether the file or folder `path` says that the command with these `words` made it, from inputs which are what
-    they were; of arguments that are too many files to be named one by one, this is not known, and taken to be so."""
+    """Whether the file or folder `path` says that the command with these `words` made it, as it is, from inputs which
+    are what they were; of arguments that are too many files to be named one by one, this is taken to be so."""
     record = origin(path)
     with suppress(InputError), as_written(path):
         said, folder = shlex.split(record["command"])[1:], Path(from_home(record["folder"]))
         for one in record["inputs"]:
             if "files" not in one:
                 _place(path if path.is_dir() else path.parent, folder, one)
-        return [from_home(word) for word in _lasting(said)] == list(words)
+        own = MADE not in record or record[MADE] == fingerprint(path)
+        return own and [from_home(word) for word in _lasting(said)] == list(words)
     return False
 
 

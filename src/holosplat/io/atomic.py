@@ -51,9 +51,9 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     try:
         yield temporary
         flushed(temporary)
+        leave_record(target, temporary)
         os.replace(temporary, target)
         flushed(target.parent)
-        leave_record(target)
     except OSError as error:
         raise InputError(f"{path} must be writable, but writing it failed: {error}.") from error
     finally:

@@ -10,15 +10,14 @@ from pathlib import Path
 
 from ..checks import InputError, require
 from .durable import flushed, flushed_tree
-from .leftovers import clear_leftovers, is_left, temporary_name
+from .leftovers import clear_leftovers, is_begun, temporary_name
 from .provenance import leave_record
 
 
 def is_taken(path: str | Path) -> bool:
-    """Whether something is at `path`: a file, a broken link, or a folder that holds more than what a process that was
-    killed at its start leaves."""
+    """Whether something is at `path`: a file, a broken link, or a folder that is begun (`is_begun`)."""
     target = Path(path)
-    return os.path.lexists(target) and (not target.is_dir() or not all(is_left(found) for found in target.iterdir()))
+    return os.path.lexists(target) and (not target.is_dir() or is_begun(target))
 
 
 def require_new(path: str | Path, way_out: str = "choose another name, or remove it first") -> None:
@@ -46,12 +45,12 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
     try:
         temporary.mkdir()
         yield temporary
+        leave_record(target, temporary)
         flushed_tree(temporary)
         if target.is_dir():  # one that `is_taken` calls free, which not every system replaces
             shutil.rmtree(target)
         os.rename(temporary, target)
         flushed(target.parent)
-        leave_record(target)
     except OSError as error:
         raise InputError(f"{path} must be writable, but writing it failed: {error}.") from error
     finally:

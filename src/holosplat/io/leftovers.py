@@ -14,6 +14,8 @@ from pathlib import Path
 
 LOCK = ".lock"
 """The file that says who writes to a folder."""
+RECORD = "provenance.json"
+"""The file of a folder that says which commands wrote there, before anything else is there."""
 LONGEST = 180
 """Bytes of a file's name that its temporary name keeps: with what is added it stays below the 255 of file systems."""
 PATTERN = re.compile(r"^\..*~(?P<host>[0-9a-f]{8})-(?P<process>[0-9a-f]+)-[0-9a-f]{8}(\.[^.]*)?$", re.DOTALL)
@@ -53,6 +55,12 @@ def files_in(folder: Path) -> Iterator[Path]:
 def is_left(path: Path) -> bool:
     """Whether a name is that of a half-written file, or of a lock."""
     return PATTERN.match(path.name) is not None or path.name == LOCK
+
+
+def is_begun(folder: Path) -> bool:
+    """Whether a folder holds more than what a process that was killed at its start leaves: locks, half-written files,
+    and the record of its command."""
+    return any(not is_left(found) and found.name != RECORD for found in folder.iterdir())
 
 
 def clear_leftovers(target: Path) -> None:

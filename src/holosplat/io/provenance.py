@@ -1,7 +1,8 @@
 """Where files come from: the command line, the version and the hashes of what was read, with every file of a command.
 
 HDF5 files have it as the attribute `provenance` of their root, folders in provenance.json, which has a record for each
-command that wrote there, other files beside them in NAME.provenance.json. Paths in one's home begin with ~.
+command that wrote there, other files beside them in NAME.provenance.json. It is there before the file is, so that
+no file is without it after a crash. Paths in one's home begin with ~.
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ from ..checks import require
 from ..tables import read_table, table_in
 from ..version import __version__, source_commit
 from .durable import flushed
-from .leftovers import LOCK, files_in, is_left, temporary_name
+from .leftovers import LOCK, clear_leftovers, files_in, is_begun, is_left, temporary_name
+from .leftovers import RECORD as NAME
 
-NAME = "provenance.json"
 ATTRIBUTE = "provenance"
-RECORDS = "records"
+RECORDS, MADE = "records", "made"
 HDF5 = b"\x89HDF\r\n\x1a\n"
 """What HDF5 files begin with."""
 GARBLED = (OSError, ValueError, LookupError, TypeError, RuntimeError)
@@ -43,12 +44,13 @@ MOST_TEXT = 16000
 @dataclass
 class Command:
     """A command that is being carried out: its words as typed, its inputs as pairs of argument and path, its outputs,
-    and whether it may replace files."""
+    whether it may replace files, and whether it goes on with what another one began."""
 
     words: Sequence[str]
     inputs: Sequence[tuple[str, Path]]
     outputs: Sequence[Path]
     force: bool = False
+    goes_on: bool = False
     folder: Path = field(default_factory=Path.cwd)
     done: set[Path] = field(default_factory=set)
     """Files that this command has written, and folders that have its record."""
@@ -132,19 +134,23 @@ def require_free(path: Path) -> None:
     )
 
 
-def leave_record(path: Path) -> None:
-    """Say where `path`, a file or folder that a command has just written, comes from: beside it, or in the folder to
-    which it belongs."""
+def leave_record(path: Path, made: Path) -> None:
+    """Say where a file or folder comes from, which a command has `made` and which becomes `path`: beside it, with what
+    is in it, in the folder itself, or in the one to which it belongs."""
     command = command_now()
     if command is None or any(map(is_left, path.parents)):  # a folder in the making
         return
     command.done.add(path)
-    folder = _folder_of(path, command) or (path if path.is_dir() else None)
-    if folder is None and not is_hdf5(path):
-        _write(beside(path), command.record(path.parent))
+    folder = _folder_of(path, command)
+    if folder is None and made.is_dir():
+        command.done.add(path / NAME)
+        _write(made / NAME, {RECORDS: [command.record(path)]})
+    elif folder is None and not is_hdf5(made):
+        _write(beside(path), command.record(path.parent) | {MADE: fingerprint(made)})
     elif folder is not None and folder / NAME not in command.done:
         command.done.add(folder / NAME)
-        _write(folder / NAME, {RECORDS: [*records(folder), command.record(folder)]})
+        before = records(folder) if command.goes_on or is_begun(folder) else []
+        _write(folder / NAME, {RECORDS: [*before, command.record(folder)]})
 
 
 def records(folder: Path) -> list[dict[str, Any]]:
@@ -238,10 +244,10 @@ def _is_private(path: Path, near: Path) -> bool:
 
 
 def _folder_of(path: Path, command: Command) -> Path | None:
-    """The folder to which a file belongs: one that the command makes, or that commands have made; None for a file that
-    stands by itself."""
+    """The folder to which a file or folder belongs: one that the command makes, or that commands have made; None for
+    what stands by itself."""
     outputs = [Path(os.path.realpath(out)) for out in command.outputs]
-    for folder in (path, *path.parents) if path.is_dir() else path.parents:
+    for folder in path.parents:
         if folder in outputs or (folder / LOCK).exists():
             return folder
         if any(out.parent == folder for out in outputs):
@@ -260,6 +266,7 @@ def is_hdf5(path: Path) -> bool:
 
 
 def _write(path: Path, values: dict[str, Any]) -> None:
+    clear_leftovers(path)
     temporary = temporary_name(path)
     temporary.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
     flushed(temporary)

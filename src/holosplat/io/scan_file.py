@@ -14,7 +14,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from ..checks import InputError, UnsaidError, finite, in_range, require, shaped
+from ..checks import InputError, UnsaidError, finite, in_range, require, shaped, warn
 from ..geometry import Views, rotation_y
 from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, checked_distance
 from ..units import ANGLE_UNITS, ENERGY_UNITS, LENGTH_UNITS, TIME_UNITS
@@ -49,6 +49,9 @@ ENERGIES = ("instrument/beam/incident_energy", "beam/incident_energy", "instrume
 ANGLES = ("sample/rotation_angle", "data/rotation_angle")
 ROTATION = "sample/view_rotation"
 TIME = "sample/time"
+COUNT_TIMES = (DETECTOR + "count_time", "control/count_time")
+SAME_TIME = 0.01
+"""Share by which times of exposure differ that were set alike."""
 PSF_SIGMA = "instrument/detector/psf_sigma"
 SPLIT = "split"
 PROVENANCE = "process/provenance"
@@ -70,6 +73,7 @@ def open_scan(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Iterator[
     with open_hdf5(path) as file:
         fields = Fields(Path(path), _entry(file, Path(path), given.get("entry")))
         kinds = _frame_kinds(fields)
+        _say_unequal_times(fields, kinds)
         _require_no_two_missing(fields, given)
         views = _views(fields, kinds, given)
         psf_sigma = _optional(fields, kinds, PSF_SIGMA, PIXEL_UNITS, "px")
@@ -144,6 +148,22 @@ def _frame_kinds(fields: Fields) -> np.ndarray:
     if not (kinds == PROJECTION).any():
         raise InputError(f"{fields.label(key)} must mark at least one projection (0), but it marks none.")
     return kinds.astype(int)
+
+
+def _say_unequal_times(fields: Fields, kinds: np.ndarray) -> None:
+    """A warning where flats or darks were exposed longer or shorter than the projections, by a `count_time` of each
+    frame: flats divide by another amount of light, and dark current grows with time."""
+    name = fields.find(*COUNT_TIMES)
+    if name is None or (times := fields.numbers(name)).shape != kinds.shape:
+        return
+    usual = float(np.median(times[kinds == PROJECTION]))
+    for kind, called in ((FLAT, "flats"), (DARK, "darks")):
+        others = times[kinds == kind]
+        if len(others) and not np.isclose(np.median(others), usual, rtol=SAME_TIME):
+            warn(
+                f"{fields.label(name)}: {called} were exposed {np.median(others):.4g} s, but projections {usual:.4g} "
+                "s; take frames of the same time, by --flats and --darks, unless the counts were scaled"
+            )
 
 
 def _require_no_two_missing(fields: Fields, given: Mapping[str, Any]) -> None:

@@ -18,7 +18,6 @@ import numpy as np
 from ..checks import InputError, UnsaidError
 from ..io.angles import angles_of
 from ..io.facts import Facts, keys_of
-from ..io.formats import loader_of
 from ..io.kept_frames import with_fields
 from ..io.loader import Loader
 from ..io.raw_file import DARK, FLAT, INVALID, NAMES, PROJECTION, ScanFile
@@ -62,9 +61,9 @@ class ScanFacts:
     unsaid: tuple[str, ...]
 
 
-def facts_of_scan(path: Path, reading: Reading) -> ScanFacts:
+def facts_of_scan(loader: Loader, path: Path, reading: Reading) -> ScanFacts:
     """Describe the scan at `path`. Errors: `InputError` for faults that stop its reading and that no option mends."""
-    loader, stand_ins, unsaid = loader_of(path), dict[str, Any](), dict[str, str]()
+    stand_ins, unsaid = dict[str, Any](), dict[str, str]()
     reading.told.vouch(path)
     while True:
         try:

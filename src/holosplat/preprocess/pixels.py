@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-from scipy.ndimage import median_filter
-from scipy.sparse import csr_array
 
 from ..checks import require, shaped, warn
 from ..frames import Taken
 from .flat_field import unlit
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 NEIGHBOURHOOD = 5
 """Edge of the window that gives the usual level of a pixel."""
@@ -31,6 +34,8 @@ def defective_pixels(dark: np.ndarray, dark_noise: np.ndarray, flat: np.ndarray)
     dark, flat: mean frames [H, W] [counts]; dark_noise: standard deviations [H, W] over the dark frames [counts],
     zeros where there are too few.
     """
+    from scipy.ndimage import median_filter  # which takes long to load
+
     light = flat - dark
     usual = median_filter(light, NEIGHBOURHOOD, mode="mirror")
     low, high = RESPONSE_RANGE
@@ -67,6 +72,8 @@ class PixelRepair:
 
     def _neighbours(self) -> csr_array:
         """The sparse matrix [B, H·W] that takes a frame to the means."""
+        from scipy.sparse import csr_array  # which takes long to load
+
         h, w = self.mask.shape
         rows, columns, entries = [], [], []
         for number, place in enumerate(self.places):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.ndimage import median_filter
 
 from ..checks import require
 
@@ -26,6 +25,8 @@ def fixed_pattern(frame: Callable[[int], np.ndarray], count: int, width: int) ->
     here in relative frames [H, W], `frame(i)`, read one at a time. Errors: `InputError` for fewer than `FEWEST`
     projections, or a width that is not odd or beyond 3 to `WIDEST`.
     """
+    from scipy.ndimage import median_filter  # which takes long to load
+
     require(
         3 <= width <= WIDEST and width % 2 == 1,
         f"rings must be an odd number of columns from 3 to {WIDEST}, but it is {width}; take 5.",

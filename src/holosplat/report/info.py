@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING
 from ..checks import InputError, as_written, require
 from ..io.atomic import atomic_path, require_writable
 from ..io.facts import Facts, facts_of_matter, no_kind
+from ..io.formats import loader_of
 from ..io.json import read_json
 from ..io.reading import Reading
+from ..memory import uncollected
 from ..units import in_percent
 from ..workflows.choice import Choice
 from ..workflows.run_folder import RunFolder
@@ -57,7 +59,8 @@ def info(path: str | Path, reading: Reading = Reading(), picture: Path | None = 
         scan is not None or picture is None, f"--picture is of the frames of a scan, but {path} shows none; leave it."
     )
     if scan is not None and picture is not None:
-        from .look import look_figure  # needs matplotlib, which takes half a second
+        with uncollected():
+            from .look import look_figure  # needs matplotlib, which takes half a second
 
         with atomic_path(picture) as temporary:
             look_figure(scan).savefig(temporary, format="png")
@@ -67,9 +70,11 @@ def info(path: str | Path, reading: Reading = Reading(), picture: Path | None = 
 
 
 def _of_scan(path: Path, reading: Reading) -> ScanFacts:
-    from ..planning.scan_facts import facts_of_scan  # needs torch, which takes longer than all else
+    loader = loader_of(path)
+    with uncollected():
+        from ..planning.scan_facts import facts_of_scan  # needs torch, which takes longer than all else
 
-    return facts_of_scan(path, reading)
+    return facts_of_scan(loader, path, reading)
 
 
 def facts_of_run(folder: RunFolder) -> Facts:
