@@ -26,7 +26,7 @@ from .truth import TruthOptions
 if TYPE_CHECKING:
     from ..methods import Method
     from ..scan import Scan
-    from ..series.settings import Settings
+    from ..series.plan import Settings
     from ..workflows.evaluate import Evaluation
     from ..workflows.reconstruct import Reconstruction
     from ..workflows.run_folder import RunFolder
@@ -50,7 +50,7 @@ class Asked:
 
     def each_time(self, method: Method, reading: Reading, seed: int) -> Settings:
         """What is done with each of several times; `InputError` for what one time alone can be asked."""
-        from ..series.settings import Settings
+        from ..series.plan import Settings
 
         require(self.geometry.options() is None, "--refine is of one time; find the one geometry by holosplat align.")
         ranges = [*self.matter.ranges(), *reading.told.ranges()]
@@ -110,7 +110,7 @@ def reconstruct(
     from ..methods import Pinn
     from ..methods.uncertain import Uncertain
     from ..planning.acts import of_space_time
-    from ..planning.seen import can_be_seen
+    from ..planning.scan_facts import can_be_seen
     from ..workflows.reconstruct import reconstruct as fit
     from ..workflows.run_folder import RunFolder, claimed
     from .motion import asks_for_motion, may_go_on, reconstruct_in_motion

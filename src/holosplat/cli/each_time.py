@@ -13,9 +13,8 @@ from ..io.reading import Reading
 from ..matter import MaterialPrior
 from ..series.collect import collect
 from ..series.folder import SeriesFolder, line_of
-from ..series.plan import plan_series
+from ..series.plan import Cut, Settings, plan_series
 from ..series.run import run_left
-from ..series.settings import Cut, Settings
 from .progress import INTERRUPTED
 from .room import tell_each_time
 from .series import UNFINISHED

@@ -146,8 +146,8 @@ def _require_free(timed: Sequence[Path], every: Sequence[int]) -> None:
 
 def _export_series(path: Path, steps: Sequence[tuple[float, Path]], grid: Grid | None, of: Contents) -> None:
     """Write what opens files of all times, if their format has such."""
+    from ..io.plain_values import write_xdmf
     from ..io.pvd import TimeStep, write_pvd
-    from ..io.xdmf import write_xdmf
 
     suffix = SERIES.get(path.suffix.lower())
     if suffix is None:
@@ -218,7 +218,7 @@ def _export_splats(result: Reconstruction, out: Path) -> None:
 
 def _export_bodies(one: Moment, out: Path) -> None:
     from ..io.solids import write_glb, write_stl
-    from ..io.vtu import write_vtu
+    from ..io.vti import write_vtu
     from .surface import write_bodies
 
     found = one.result.object

@@ -12,17 +12,17 @@ from tyro.conf import Positional, arg, subcommand
 from ..checks import require
 from ..io.reading import Reading
 from ..ranges import Jobs, Positive, Seed, ranged
-from ..series.settings import Cut, Slurm
-from .bodies import BodyFlags, MotionFlags
+from ..series.plan import Cut, Slurm
 from .light import RunLightFlags
 from .options import MethodOptions, PriorOptions
 from .places import Output, with_checked_arguments
 from .progress import INTERRUPTED
+from .track import BodyFlags, MotionFlags
 
 if TYPE_CHECKING:
     from ..series.folder import Row, SeriesFolder
+    from ..series.plan import Settings
     from ..series.run import Counts
-    from ..series.settings import Settings
 
 UNFINISHED = 4
 """Exit code of `series run` and `collect` where tasks failed or are left."""
@@ -54,7 +54,7 @@ class Act:
 
     def settings(self, track: bool, seed: int) -> Settings:
         """The settings of each task; `InputError` for options of the other act."""
-        from ..series.settings import Settings, Warm
+        from ..series.plan import Settings, Warm
 
         stray = _changed(self.motion, self.known) if not track else _changed(self.how)
         other = "goes with --track" if not track else "is of reconstruct; leave it, or --track"
@@ -122,9 +122,9 @@ def plan(
         seed: Seed of everything random.
         track: Follow closed bodies through all times of a task, as holosplat track does; else each is reconstructed.
     """
-    from ..series.appearing import listed
     from ..series.folder import SeriesFolder
     from ..series.plan import plan_series
+    from ..series.watch import listed
 
     require(not matter.ranges(), "a series needs one number for --delta-beta; find it by reconstruct of one time.")
     settings = act.settings(track, seed)

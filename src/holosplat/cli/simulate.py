@@ -32,8 +32,8 @@ from .truth import TruthOptions
 if TYPE_CHECKING:
     import numpy as np
 
-    from ..beamline.scenes import Filling
     from ..beamline.series import Timing
+    from ..beamline.simulate import Filling
     from ..geometry import Views
     from ..scan import Exposures
     from ..specimens.carried import CarriedScene
@@ -41,8 +41,7 @@ if TYPE_CHECKING:
     from ..specimens.drawn import Drawn
     from ..specimens.mesh_series import MeshSeries
     from ..specimens.rods import RodScene
-    from ..specimens.scene import MeshScene
-    from ..specimens.voxel_scene import VoxelScene
+    from ..specimens.scene import MeshScene, VoxelScene
     from ..volume import Object
 
     Still = MeshScene | ContinuousScene | VoxelScene | CarriedScene | RodScene
@@ -165,9 +164,9 @@ def _specimen(
     """The bodies of `meshes`: moving, where there is a `timing`."""
     import numpy as np
 
-    from ..beamline.scenes import read_scene
     from ..beamline.series import read_series
-    from ..io.snapshots import COLLECTION, seeming_snapshots
+    from ..beamline.simulate import read_scene
+    from ..io.pvd import COLLECTION, seeming_snapshots
 
     if timing is None:
         files.require_static()

@@ -12,7 +12,7 @@ from typing import Any
 from tyro.conf import Positional
 
 from ..checks import require
-from ..io.folder import atomic_folder
+from ..io.atomic import atomic_folder
 from ..io.json import write_json
 from ..io.reading import Reading
 from ..io.volume_formats import read_volume_file

@@ -22,8 +22,7 @@ from typing import Any
 from ..checks import require
 from ..tables import read_table, table_in
 from ..version import __version__, source_commit
-from .durable import flushed
-from .leftovers import LOCK, files_in, is_left, temporary_name
+from .leftovers import LOCK, files_in, flushed, is_left, temporary_name
 
 NAME = "provenance.json"
 ATTRIBUTE = "provenance"

@@ -19,7 +19,7 @@ from ..geometry import Grid, Views
 from ..matter import DeltaBeta
 from ..volume import LineIntegrals, Volume
 from .continuous import Bump, ContinuousScene, Element, Soft, ellipsoid, random_rotation
-from .foam import random_foam
+from .phantoms import random_foam
 
 CORE = 0.93
 """Share of a bubble's radius within which gas is lost: its sharp inside, less what other bubbles distort it by."""
