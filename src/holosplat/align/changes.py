@@ -1,4 +1,4 @@
-"""Changes of views from their plan: as numbers, in words and in tables."""
+"""Changes of views from their plan, as numbers, words and tables; the common motion that no frame determines."""
 
 from __future__ import annotations
 

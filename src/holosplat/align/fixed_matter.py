@@ -1,4 +1,9 @@
-"""Poses of frames with fixed matter of any kind, from its own projections and small steps."""
+"""Poses of frames with fixed matter of any kind, by small steps from its projections, or with fitted surfaces.
+
+Poses and distances by matter with sharp edges: closed surfaces cut out of the voxels, fitted with the geometry free.
+Voxels have soft edges, and a distance that is too long sharpens fringes just as sharper edges would. Surfaces have none
+of that freedom: where they explain the frames, they tell the distance, and poses several times better.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Beamlines that are not where they say: errors of each view's pose and distance, drawn by a seed."""
+"""Beamlines that are not where they say: errors of each view by a seed; and poses that a file lists."""
 
 from __future__ import annotations
 

@@ -1,4 +1,11 @@
-"""Poses of bodies of known rest shape on straight paths, and what they explain of the shadows of several times."""
+"""Poses of bodies of known rest shape on straight paths, and what they explain of the shadows of several times.
+
+The two-view ambiguity: bodies whose shadows in two beams have the same size and tilt.
+Parallel beams along d₁ and d₂ determine the second moments Q of a body up to one number: with N = d₁ d₂ᵀ + d₂ d₁ᵀ, the
+shadows of Q + s N have the same moments for every s. Two of these have the same volume: s = 0, and
+s = 2 a₁₂/(a₁₁ a₂₂ - a₁₂²), a = dᵢᵀ Q⁻¹ dⱼ (det(1 + s Q⁻¹ N) = (1 + s a₁₂)² - s² a₁₁ a₂₂ is one there). A search that
+takes bodies for ellipsoids of a known volume finds the one or the other; finer details of the frames distinguish them.
+"""
 
 from __future__ import annotations
 

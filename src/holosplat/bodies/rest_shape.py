@@ -1,4 +1,4 @@
-"""Bodies of known rest shape: red cells, or any closed mesh, as fine as they are needed."""
+"""Bodies of known rest shape (red cells, any closed mesh); bodies cut out of a volume; moments of meshes."""
 
 from __future__ import annotations
 

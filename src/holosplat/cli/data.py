@@ -1,4 +1,4 @@
-"""`holosplat data`: public sample data, listed and fetched."""
+"""The commands `info`, `data`, `materials` and `check`: what files are, samples, named materials, checksums."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The options of the light beside the flat fields."""
+"""The options of the light beside the flat fields, and numbers that may say their unit."""
 
 from __future__ import annotations
 

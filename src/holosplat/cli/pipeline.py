@@ -23,6 +23,7 @@ from .entry import command
 from .help import CONFIG, Option, is_essential, options_of, parser_of, wrap
 from .places import Place, is_run, of_times, places_of, require_apart
 from .resume import OF_ONE_CALL, is_made_by
+from .sentence import say
 
 STAGES = ("correct", "align", "reconstruct", "export")
 """Commands that a pipeline file may have as tables, in the order in which they run."""
@@ -91,7 +92,7 @@ class Stage:
         """Do what is left of it. Errors: `InputError` where that replaces what others made, without `redo`."""
         state, outs = self.state(), " and ".join(str(out.path) for out in self.outputs())
         if state == "done":
-            _say(f"[{self.name}] is done: {outs} is whole, and made by the same options from the same input")
+            say(f"[{self.name}] is done: {outs} is whole, and made by the same options from the same input")
             return
         require(
             state != "other" or redo,
@@ -101,7 +102,7 @@ class Stage:
         how = "resume" if state == "begun" and self._can_resume else "force"
         more = {how: True} if state != "new" else {}
         words = [*self.words, *(f"--{name}" for name in more)]
-        _say(f"[{self.name}] holosplat {' '.join(words)}")
+        say(f"[{self.name}] holosplat {' '.join(words)}")
         given = self.given.signature.bind(*self.given.args, **self.given.kwargs)
         given.arguments |= more
         with _typed(words):
@@ -288,7 +289,3 @@ def _typed(words: Sequence[str]) -> Iterator[None]:
         yield
     finally:
         sys.argv = before
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr)

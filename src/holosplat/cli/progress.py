@@ -1,4 +1,4 @@
-"""What commands say while they work: notes on the input, progress, and the exit code of an interrupted one."""
+"""What commands say while they work: notes, progress, their log file; and the signals that end them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`holosplat track`: closed bodies through the times of a scan."""
+"""`holosplat track`: closed bodies through the times of a scan, and the options of their known shape."""
 
 from __future__ import annotations
 

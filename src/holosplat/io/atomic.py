@@ -1,4 +1,4 @@
-"""Writing a file whole or not at all, so that it is there after a crash, too."""
+"""Writing a file or a folder whole or not at all, so that it is there after a crash, too."""
 
 from __future__ import annotations
 

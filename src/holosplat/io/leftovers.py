@@ -1,4 +1,4 @@
-"""What a killed process leaves of files it was writing: named so that nobody reads it, and the next one removes it."""
+"""Names of half-written files, the removal of those that a killed process leaves, and files flushed to the disk."""
 
 from __future__ import annotations
 

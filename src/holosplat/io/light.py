@@ -1,4 +1,4 @@
-"""The light of a run's training frames, as a file."""
+"""The light of a run's training frames as a file, and the light that a scan's frames were divided by."""
 
 from __future__ import annotations
 

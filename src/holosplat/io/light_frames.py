@@ -1,4 +1,4 @@
-"""Flats and darks in files of their own (--flats, --darks), of any format."""
+"""Flats and darks in files of their own (--flats, --darks), and frames of HDF5 datasets that have no data."""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""δ (or µ) and β as plain float32 numbers, x fastest, as files of VTK, NRRD and MRC hold them: written slab by slab."""
+"""δ (or µ) and β as plain float32 numbers, x fastest, as files of VTK, NRRD and MRC hold them: written slab by slab.
+
+Volumes of several times in HDF5 as one XDMF file (xdmf.org), for ParaView and VisIt: lengths in µm, times in s.
+It holds no values, but names the HDF5 files relative to its folder, so that it can move with them.
+"""
 
 from __future__ import annotations
 

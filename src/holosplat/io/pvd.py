@@ -1,6 +1,8 @@
-"""Time series of mesh files: ParaView's collection (.pvd), an XML list of files with the time of each.
+"""Time series of mesh files: ParaView's collection (.pvd), and the snapshots that a folder or a list of files has.
 
 ParaView opens only VTK's XML files from a collection, such as .vtp and .vtu, and no legacy .vtk; `read_pvd` takes both.
+
+A body's files have the same name except for the number at the end: `rbc03_007.vtk` is body `rbc03`, snapshot 7.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Files of frames of all kinds (projections, flats, darks) that are open for reading, whatever their format."""
+"""Files of frames of all kinds (projections, flats, darks) that are open for reading, and the loaders of formats."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The scan that a run folder was made from: `source.json` there names it, and the time that was chosen."""
+"""The scan that a run folder was made from, as `source.json` names it, and the marks of a run's HDF5 files."""
 
 from __future__ import annotations
 

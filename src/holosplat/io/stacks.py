@@ -1,4 +1,4 @@
-"""Frames in image files (TIFF, PNG) and NumPy arrays, read one by one when they are asked for."""
+"""Frames in image files (TIFF, PNG) and NumPy arrays, read one by one; checks of TIFF files before they are read."""
 
 from __future__ import annotations
 

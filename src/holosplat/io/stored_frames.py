@@ -1,4 +1,4 @@
-"""Projections of raw files, flat-field corrected and mended when they are read."""
+"""Projections of raw files, flat-field corrected and mended when they are read; which frames of a file count."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""JSON tables with clear messages, for the readers of folders."""
+"""JSON tables with clear messages, and the exposures that they hold, for the readers of folders."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The formats of volumes, by the suffixes of their files: what writes one, and what reads it again."""
+"""The formats of volumes, by the suffixes of their files, and volumes of shares that others wrote."""
 
 from __future__ import annotations
 

@@ -1,6 +1,10 @@
 """Volumes as VTK image data (.vti), for ParaView, PyVista and VisIt: δ and β as point data, lengths in µm.
 
 Points are voxel centres. The values are appended to the XML as they are, so that writing takes no memory for them.
+
+All bodies of one time in one file of VTK's unstructured grids (.vtu): triangles in µm, with data of their bodies.
+Cell data: `body`, its number from 0 on; `delta` (`mu_per_m` where δ is not known), `beta` of its matter; `volume_m3`,
+what it encloses. Field data: `length_unit_m`, a number: some readers take no texts.
 """
 
 from __future__ import annotations

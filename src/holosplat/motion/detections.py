@@ -1,4 +1,4 @@
-"""Bodies at single times: a volume of each time, by tomography or by a network, cut into closed surfaces."""
+"""Bodies at single times: volumes cut into closed surfaces, and bodies that the frames show beside known ones."""
 
 from __future__ import annotations
 

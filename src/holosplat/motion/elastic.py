@@ -1,4 +1,4 @@
-"""Elastic energy of bodies of known rest shape as a prior: that of their membranes, in likelihoods.
+"""Elastic energy of bodies of known rest shape as a prior, and the terms of a fit of bodies in motion.
 
 Frames decide what they can see of a shape; what they cannot see, the rest shape decides. The membrane is that of
 `specimens.membrane`: Skalak's shear and dilation, bending of its edges, its whole area. Moduli go with the body's size,

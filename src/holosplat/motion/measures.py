@@ -1,4 +1,9 @@
-"""Numbers of bodies in motion: where they are, how fast, how large, of what shape, how they turn."""
+"""Numbers of bodies in motion: place, velocity, size, shape, spin; and their errors from halves of the frames.
+
+Standard errors from halves of the frames: what two fits that share no frame disagree by.
+Both start from the result of all frames. If halves err independently, each by √2 of what all frames do, half their
+difference is a draw of the error of the result. It tells what noise does, and not what all frames have in common.
+"""
 
 from __future__ import annotations
 

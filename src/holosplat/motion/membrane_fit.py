@@ -2,6 +2,12 @@
 
 Motion along a surface is not seen, so where the nodes of a membrane are on it is not known; of all places those of
 least energy are taken.
+
+Cells in a channel as a differentiable model of motion: where membranes are later, given where they are now.
+The physics is that of `specimens/flow`: every node moves with the fluid, Stokes' flow without inertia, one viscosity
+inside and outside, the channel's undisturbed flow and regularised Stokeslets of all membrane forces; no answer of the
+walls to these. What is unknown of it are a few numbers (`Unknowns`), and all steps can be differentiated by them and by
+the first state: the time steps are even, and each is computed again on the way back, so that memory is that of one.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The frames of several times, ready to be compared with what a flow carries."""
+"""The frames of several times, to be compared with a flow; and the same flow in richer bases."""
 
 from __future__ import annotations
 

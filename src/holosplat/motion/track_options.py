@@ -1,4 +1,4 @@
-"""How bodies are followed through time: the options of `track`."""
+"""How bodies are followed through time: the options of `track`, and the journal of a run."""
 
 from __future__ import annotations
 

@@ -13,8 +13,8 @@ import torch
 
 from ..checks import as_written
 from ..geometry import Grid, Views
-from ..io.guess import read_guess
 from ..io.json import read_json
+from ..io.volumes import read_guess
 from ..methods import METHODS, learned
 from ..motion.measures import columns, measured
 from ..optics.background import Light

@@ -1,4 +1,4 @@
-"""Shaded isosurfaces without a graphics card: orthographic first-hit ray marching in numpy.
+"""Shaded isosurfaces without a graphics card: orthographic first-hit ray marching in numpy; forecasts drawn so.
 
 The camera follows the frames of docs/conventions.md: it is a view, `x_lab = R x_obj`, that looks along the
 beam (+z_lab), with columns to the right and rows down. A surface seen with a hologram's rotation overlays it.

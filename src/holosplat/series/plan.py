@@ -1,4 +1,4 @@
-"""The plan of a series: its scans, the times in them, and the windows of times that are its tasks."""
+"""The plan of a series: its scans, times and windows of times, and the settings of their reconstruction."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Balls: packed at random without touching, and in series of shrinking size that show the resolution."""
+"""Balls (packed at random, or in series of shrinking size), capsules of two materials, and foam."""
 
 from __future__ import annotations
 

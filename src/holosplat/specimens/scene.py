@@ -1,4 +1,4 @@
-"""A scene of closed triangle meshes, each filled with one material: the truth that simulations start from."""
+"""Truths that simulations start from: closed triangle meshes, each of one material, and volumes of voxels."""
 
 from __future__ import annotations
 

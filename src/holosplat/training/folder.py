@@ -1,4 +1,4 @@
-"""A dataset folder of scenes: shards in HDF5, made in one or several processes, and a datasheet."""
+"""A dataset folder of scenes (shards in HDF5, a datasheet), and scenes as a `torch` dataset."""
 
 from __future__ import annotations
 

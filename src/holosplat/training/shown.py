@@ -1,4 +1,4 @@
-"""Training examples: some views of a sample, mirrored and rotated; the loss and the Dice coefficient."""
+"""Training examples (some views of a sample, mirrored and rotated), the loss, the Dice coefficient, validation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,10 @@
-"""The content of the view in three dimensions, and its text in the page."""
+"""The view in three dimensions: the parts that it shows, and its text in the page.
+
+Objects as the page embeds them: small integers, and the numbers that bring them back.
+Lengths are in raster pixels of the view. Places are stored as 16 bits of the box that holds them (an error of the box
+over 131 072), volumes as 8 bits of their range (1/512 of it at most, which averages out along a ray), deviations and
+amplitudes of Gaussians as half floats (2^-12 of their value).
+"""
 
 from __future__ import annotations
 

@@ -1,9 +1,14 @@
-"""Flow through a straight rectangular channel: Poiseuille's, in closed form.
+"""Flow through a straight rectangular channel (Poiseuille's, in closed form), and contacts of bodies in it.
 
 For half widths a ≤ b across the channel, with y and z measured from its axis (White 2006, Viscous Fluid Flow, eq. 3-48,
 the parabola of the shorter side taken out of the series, so that the remainder falls off exponentially from the ends):
 
     u = G/2μ (a² - y² - 32 a²/π³ Σ (-1)^((n-1)/2)/n³ cos(nπy/2a) cosh(nπz/2a)/cosh(nπb/2a)),   n = 1, 3, 5 …
+
+Repulsion where cells come close to each other or to a wall.
+In a viscous fluid the film between two surfaces keeps them apart; nodes half a micrometre apart do not resolve it. A
+short-ranged force between nodes takes its place: F (1 - r/d)²/(r/d)² below the distance d, smooth where it begins and
+without bound at r = 0.
 """
 
 from __future__ import annotations

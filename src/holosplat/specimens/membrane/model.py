@@ -1,4 +1,17 @@
-"""The membrane of a cell: its rest shape and elastic moduli, its energies and forces."""
+"""The membrane of a cell: its rest shape and elastic moduli, its energies and forces.
+
+Elastic energies of a membrane [J], each a differentiable function of its nodes.
+The object-in-fluid model (Dupin et al. 2007, Phys. Rev. E 75, 066707; Cimrák, Gusenbauer & Schrefl 2012, Comput. Math.
+Appl. 64, 278; Cimrák, Gusenbauer & Jančigová 2014, Comput. Phys. Commun. 185, 900) is springs along edges, bending,
+local and global area, and volume; its forces were published; the energies here have these forces as gradients (areas:
+in the form that has an energy). Skalak et al. (1973, Biophys. J. 13, 245) is the continuum alternative to springs.
+Nodes are [..., P, 3] [m], energies [...].
+
+A cell stretched in optical tweezers: the test that every membrane model is put to.
+Two beads stick to opposite ends of the rim and are pulled apart (Dao, Lim & Suresh 2003, J. Mech. Phys. Solids 51,
+2259; Mills et al. 2004, Mech. Chem. Biosyst. 1, 169). The cell is so slow to be pulled that it is always at rest:
+at each force the shape is the one of least energy, found from the shape at the force before.
+"""
 
 from __future__ import annotations
 

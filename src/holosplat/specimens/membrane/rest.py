@@ -1,4 +1,4 @@
-"""The unstressed membrane: which nodes, edges and triangles it has, and their lengths, areas and angles at rest."""
+"""The unstressed membrane: its nodes, edges and triangles, their lengths, areas and angles, and their derivatives."""
 
 from __future__ import annotations
 
