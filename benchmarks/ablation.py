@@ -28,7 +28,7 @@ import numpy as np
 from machine import commit
 
 import holosplat as hs
-from holosplat.beamline.declared.case import Case
+from holosplat.beamline.declared.declaration import Case
 from holosplat.methods import Task, finished
 from holosplat.methods.gaussians import GaussianStage
 from holosplat.workflows.evaluate import score_object

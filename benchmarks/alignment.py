@@ -24,8 +24,8 @@ from scipy.spatial.transform import Rotation
 
 import holosplat as hs
 from holosplat.align import PoseOptions, PosePrior, align_views
-from holosplat.align.gauge import moved_onto
-from holosplat.beamline.declared.case import Case
+from holosplat.align.changes import moved_onto
+from holosplat.beamline.declared.declaration import Case
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.methods import Auto, Gaussians, Method
 from holosplat.metrics import volume_scores

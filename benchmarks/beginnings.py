@@ -25,7 +25,7 @@ from machine import commit
 from rows import written
 
 import holosplat as hs
-from holosplat.beamline.declared.case import Case
+from holosplat.beamline.declared.declaration import Case
 from holosplat.methods import smooth_fit
 from holosplat.methods.illumination import prepared
 from holosplat.methods.method import Task, begun, run_quietly

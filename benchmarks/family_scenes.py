@@ -22,8 +22,7 @@ import torch
 from random_scenes import KINDS, Draw, Room
 
 import holosplat as hs
-from holosplat.beamline.declared.soft_specimens import Continuous
-from holosplat.beamline.declared.specimens import RedCells, Specimen
+from holosplat.beamline.declared.specimens import Continuous, RedCells, Specimen
 from holosplat.beamline.light import UnevenLight
 from holosplat.geometry import Grid, Views
 from holosplat.metrics import volume_scores

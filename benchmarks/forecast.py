@@ -25,8 +25,7 @@ from machine import commit
 from rows import replaced
 
 import holosplat as hs
-from holosplat.bodies.moments import centroid
-from holosplat.bodies.rest_shape import KnownBody
+from holosplat.bodies.rest_shape import KnownBody, centroid
 from holosplat.geometry import Grid
 from holosplat.io.objects import read_object, write_object
 from holosplat.matter import Matter
@@ -36,7 +35,7 @@ from holosplat.motion.cell_model import ChannelFrame
 from holosplat.motion.dynamics import DynamicsForecast, carry
 from holosplat.motion.elastic import Rest
 from holosplat.motion.forecast import Forecast, Halves, PathForecast, extrapolate
-from holosplat.motion.split_half_errors import half_sets
+from holosplat.motion.measures import half_sets
 from holosplat.motion.track import TrackOptions, follow
 from holosplat.representations import MovingSurfaces
 from holosplat.representations.paths import TimeBasis

@@ -27,8 +27,7 @@ from rows import merge
 import holosplat as hs
 from holosplat.io.formats import read_as
 from holosplat.io.reading import Part, Reading
-from holosplat.show.server import HOST, LiveView
-from holosplat.show.watch import Watch
+from holosplat.show.server import HOST, LiveView, Watch
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "data" / "live_view.csv"
 COLUMNS = ("scan", "view", "run", "steps", "gaussians", "updates", "view_cpu_s", "cpu_s", "wall_s", "commit")

@@ -30,8 +30,7 @@ from machine import commit
 
 import holosplat as hs
 from holosplat.matter import MatterKind
-from holosplat.specimens.capsules import place_capsules
-from holosplat.specimens.phantoms import packed_balls
+from holosplat.specimens.phantoms import packed_balls, place_capsules
 
 PIXEL, ENERGY = 1e-6, 20.0
 SQUARE, WIDE = (64, 64), (49, 65)

@@ -27,14 +27,12 @@ from rows import replaced, shown
 from scipy.spatial.transform import Rotation
 
 import holosplat as hs
-from holosplat.bodies.moments import centroid, second_moments
-from holosplat.bodies.rest_shape import KnownBody
+from holosplat.bodies.rest_shape import KnownBody, centroid, second_moments
 from holosplat.geometry import Grid
 from holosplat.mesh import TriangleMesh
 from holosplat.metrics import volume_scores
 from holosplat.motion.fit import MotionFit
-from holosplat.motion.measures import area
-from holosplat.motion.split_half_errors import standard_errors
+from holosplat.motion.measures import area, standard_errors
 from holosplat.motion.track import Followed, TrackOptions, follow
 from holosplat.representations import MovingSurfaces
 from holosplat.specimens.mesh_series import MeshSeries

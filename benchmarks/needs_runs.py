@@ -25,7 +25,7 @@ from holosplat.io import read_scan
 from holosplat.io.json import read_json
 from holosplat.methods import Auto
 from holosplat.planning.needs import Sizes, of_reconstruction
-from holosplat.planning.seen import seen_of
+from holosplat.planning.scan_facts import seen_of
 from holosplat.workflows.demo import write_demo_meshes
 
 KNOWN = ("--material", "haemoglobin")

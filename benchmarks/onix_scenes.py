@@ -26,7 +26,7 @@ from machine import commit
 from rows import read, write
 
 import holosplat as hs
-from holosplat.beamline.declared.case import Case
+from holosplat.beamline.declared.declaration import Case
 from holosplat.geometry import Grid
 from holosplat.methods import Onix
 from holosplat.training.aligned import AlignedTraining, AlignedValidation
@@ -34,8 +34,8 @@ from holosplat.training.folder import Dataset, make_dataset
 from holosplat.training.options import FrameLossWeights, TrainOptions, ViewSampling
 from holosplat.training.ranges import Ranges
 from holosplat.training.sample import drawn_case
+from holosplat.training.shown import Validation
 from holosplat.training.train import WEIGHTS, made_by
-from holosplat.training.validate import Validation
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "data" / "onix_scenes.csv"
 LEARNT = Ranges(rows=48, columns=48, views=4, across=(8.0, 16.0), noiseless=0.5, tilted=0.0)

@@ -37,7 +37,7 @@ from machine import commit
 from rows import read, write
 from scipy import fft
 
-from holosplat.beamline.declared.case import Case
+from holosplat.beamline.declared.declaration import Case
 from holosplat.beamline.simulate import Simulation, simulated_frames
 from holosplat.model import Instrument
 from holosplat.scan import Exposures

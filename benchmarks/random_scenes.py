@@ -27,17 +27,30 @@ from machine import commit
 from rows import read, write
 
 import holosplat as hs
-from holosplat.beamline.declared.case import Case, case_of
-from holosplat.beamline.declared.declaration import Beam, Declaration, Detector, Listed, Matter, Substance
-from holosplat.beamline.declared.soft_specimens import (
+from holosplat.beamline.declared.declaration import (
+    Beam,
+    Case,
+    Declaration,
+    Detector,
+    Listed,
+    Matter,
+    Substance,
+    case_of,
+)
+from holosplat.beamline.declared.specimens import (
+    BallStar,
     BodyWithAbsorber,
+    Capsules,
     CoatedDroplets,
+    CrowdedCells,
+    FoamDrop,
+    RedCells,
     RoundCell,
     SheppLogan,
     SoftCells,
+    Specimen,
     Tissue,
 )
-from holosplat.beamline.declared.specimens import BallStar, Capsules, CrowdedCells, FoamDrop, RedCells, Specimen
 from holosplat.beamline.light import UnevenLight
 from holosplat.geometry import Grid
 from holosplat.metrics import volume_scores

@@ -56,9 +56,8 @@ from holosplat.methods import Method
 from holosplat.methods.presets import preset
 from holosplat.metrics import volume_scores
 from holosplat.series.folder import Row, SeriesFolder
-from holosplat.series.plan import plan_series
+from holosplat.series.plan import Cut, Settings, Warm, plan_series
 from holosplat.series.run import PROGRAM, states
-from holosplat.series.settings import Cut, Settings, Warm
 from holosplat.series.task import run_task
 from holosplat.specimens.mesh_series import MeshSeries
 from holosplat.specimens.red_cells import random_cells

@@ -21,9 +21,8 @@ from scipy.spatial.transform import Rotation
 
 import holosplat as hs
 from holosplat.align import Drift, PoseOptions, align_views
-from holosplat.align.gauge import moved_onto
-from holosplat.beamline.misalignment import Misalignment
-from holosplat.beamline.poses import GEOMETRIES, Directions, Geometry
+from holosplat.align.changes import moved_onto
+from holosplat.beamline.misalignment import GEOMETRIES, Directions, Geometry, Misalignment
 from holosplat.mesh import TriangleMesh
 from holosplat.metrics import volume_scores
 from holosplat.specimens.mesh_series import MeshSeries

@@ -23,7 +23,7 @@ from scipy.ndimage import label
 from torch import Tensor
 
 import holosplat as hs
-from holosplat.bodies.cut import parted
+from holosplat.bodies.rest_shape import parted
 from holosplat.inference import Compared
 from holosplat.learning.start import Guessed, LearnedStart, guess_matter, unexplained
 from holosplat.matter import Matter

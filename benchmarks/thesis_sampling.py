@@ -17,7 +17,7 @@ import numpy as np
 from machine import commit
 from rows import written
 
-from holosplat.beamline.declared.case import Case
+from holosplat.beamline.declared.declaration import Case
 from holosplat.model import Instrument
 from holosplat_bench.suite.case import load_case
 from holosplat_bench.thesis.configurations import PHYSICS

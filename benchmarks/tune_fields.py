@@ -28,7 +28,7 @@ import torch
 from changes import changed
 from machine import commit
 
-from holosplat.beamline.declared.case import Case
+from holosplat.beamline.declared.declaration import Case
 from holosplat.methods import Method, NeuralFields, NeuralFit, Task, VoxelFit, Voxels, finished
 from holosplat.methods.presets import preset
 from holosplat.methods.voxels import HolographicStage

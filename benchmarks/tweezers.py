@@ -19,9 +19,8 @@ import numpy as np
 from machine import commit
 
 from holosplat.io.atomic import atomic_path
-from holosplat.specimens.membrane.model import Elasticity, Membrane
+from holosplat.specimens.membrane.model import Elasticity, Membrane, Stretched, stretch
 from holosplat.specimens.membrane.resting import resting_cell
-from holosplat.specimens.membrane.tweezers import Stretched, stretch
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt

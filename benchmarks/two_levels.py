@@ -20,7 +20,7 @@ from machine import commit
 
 from holosplat.baselines import holographic_tv
 from holosplat.baselines.two_materials import Levels, best_levels
-from holosplat.beamline.declared.case import Case
+from holosplat.beamline.declared.declaration import Case
 from holosplat.matter import MaterialPrior
 from holosplat.methods.assumed import assumed_material
 from holosplat.methods.presets import preset

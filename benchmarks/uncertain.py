@@ -20,7 +20,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 from machine import commit
 
-from holosplat.beamline.declared.case import Case
+from holosplat.beamline.declared.declaration import Case
 from holosplat.matter import KnownRatio, MaterialPrior
 from holosplat.methods import Task
 from holosplat.methods.illumination import prepared

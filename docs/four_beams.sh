@@ -48,7 +48,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from holosplat.align.gauge import moved_onto
+from holosplat.align.changes import moved_onto
 from holosplat.align.changes import changes
 from holosplat.io import read_beams, read_scan
 

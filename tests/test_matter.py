@@ -10,7 +10,7 @@ import pytest
 from holosplat import MaterialPrior
 from holosplat.checks import InputError
 from holosplat.materials import DeltaBeta
-from holosplat.series.settings import prior_of
+from holosplat.series.plan import prior_of
 
 SOFT, BONE = DeltaBeta(1e-7, 1e-10), DeltaBeta(5e-7, 5e-9)
 KINDS = {

@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 
 import holosplat as hs
-from holosplat.beamline.misalignment import Misalignment
-from holosplat.beamline.poses import Directions
+from holosplat.beamline.misalignment import Directions, Misalignment
 from holosplat.beamline.simulate import Shutter
 from holosplat.report.style import PanelGrid, image_panel, letter, scale_bar, styled
 from holosplat.specimens.mesh_series import MeshSeries

@@ -9,7 +9,7 @@ import pytest
 
 from helpers.discs import PITCH, ball_lines
 from holosplat.align import find_axis
-from holosplat.align.half_turn import may_be_half
+from holosplat.align.consistency import may_be_half
 from holosplat.geometry import Views
 from holosplat.scan import Exposures, Scan
 

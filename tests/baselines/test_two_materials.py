@@ -30,7 +30,7 @@ from holosplat.model import Instrument, measure
 from holosplat.representations import GaussianCloud, VoxelLines, approximate, cloud_from_shares
 from holosplat.representations.gaussians import raw_of
 from holosplat.scan import Exposures, Scan
-from holosplat.specimens.capsules import place_capsules
+from holosplat.specimens.phantoms import place_capsules
 from holosplat.specimens.red_cells import random_cells
 from holosplat.specimens.scene import MeshScene
 from holosplat.volume import LineIntegrals

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from helpers.imaging import cells, taken
-from holosplat.beamline.scenes import Filling
-from holosplat.beamline.simulate import Simulation, polychromatic_frames, read_spectrum, refilled, simulate
+from holosplat.beamline.simulate import Filling, Simulation, polychromatic_frames, read_spectrum, refilled, simulate
 from holosplat.checks import InputError
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.optics.coherence import Spectrum

@@ -12,8 +12,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import holosplat.io.volumes as volumes
-from holosplat.beamline.misalignment import Misalignment
-from holosplat.beamline.poses import GEOMETRIES, Directions
+from holosplat.beamline.misalignment import GEOMETRIES, Directions, Misalignment
 from holosplat.beamline.simulate import Shutter, Simulation, simulate, simulated_frames
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views, rotation_tilted

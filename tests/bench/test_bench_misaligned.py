@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 import holosplat as hs
 from helpers.bench_shop import MATERIAL, PITCH
-from holosplat.align.gauge import moved_onto
-from holosplat.beamline.declared.case import Case
+from holosplat.align.changes import moved_onto
+from holosplat.beamline.declared.declaration import Case
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.matter import Matter
 from holosplat.representations.voxels import VoxelGrid

@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter
 
 import holosplat as hs
 from helpers.bench_shop import MATERIAL, PITCH, Recorder, fail, make_case, suite, voxels
-from holosplat.beamline.declared.case import Case
+from holosplat.beamline.declared.declaration import Case
 from holosplat.matter import Matter
 from holosplat.optics.sampling import fringe_sampling
 from holosplat.representations.voxels import VoxelGrid

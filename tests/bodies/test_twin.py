@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import holosplat as hs
-from holosplat.bodies.twin import distance, twin_map, twin_of, two_beams
+from holosplat.bodies.poses import distance, twin_map, twin_of, two_beams
 from holosplat.geometry import rotation_y
 
 PIXEL, SHAPE = 1e-6, (29, 35)

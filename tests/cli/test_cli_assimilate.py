@@ -15,13 +15,13 @@ import holosplat.cli.track as command
 import holosplat.workflows.track as workflow
 from helpers.cli import holosplat, refused, worked
 from helpers.pictures import undrawn
-from holosplat.bodies.moments import centroid
+from holosplat.bodies.rest_shape import centroid
 from holosplat.io.nxtomo import write_scan
 from holosplat.io.objects import read_object
 from holosplat.matter import Matter
 from holosplat.mesh import TriangleMesh
-from holosplat.motion.cell_flow import Unknowns
 from holosplat.motion.cell_model import CellModel, ChannelFrame
+from holosplat.motion.membrane_fit import Unknowns
 from holosplat.motion.track import Followed
 from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.specimens.red_cells import RedCell, icosphere

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from holosplat.cli import entry
-from holosplat.cli.signals import ASKING, end_as_on_interrupt
+from holosplat.cli.progress import ASKING, end_as_on_interrupt
 from holosplat.fit.running import interrupts_held
 
 

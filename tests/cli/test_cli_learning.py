@@ -8,7 +8,7 @@ import pytest
 
 from helpers.cli import MATTER, holosplat, known, refused, worked
 from holosplat.cli.options import MethodOptions
-from holosplat.io.guess import read_guess
+from holosplat.io.volumes import read_guess
 from holosplat.learning.network import Guess, Size
 from holosplat.learning.weights import Card, read_weights, write_weights
 from holosplat.methods import Gaussians

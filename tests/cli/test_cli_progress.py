@@ -9,8 +9,7 @@ import sys
 import pytest
 
 from helpers.cli import holosplat, refused
-from holosplat.cli.log import logged
-from holosplat.cli.progress import ProgressBar
+from holosplat.cli.progress import ProgressBar, logged
 
 
 @pytest.fixture

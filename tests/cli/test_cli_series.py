@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from helpers.cli import FORMULA, QUICK, everything_in, holosplat, refused, worked
-from holosplat.beamline.scenes import Filling, read_scene
-from holosplat.beamline.simulate import simulate
+from holosplat.beamline.simulate import Filling, read_scene, simulate
 from holosplat.geometry import Views, rotation_tilted
 from holosplat.io.nxtomo import read_scan
 from holosplat.io.volumes import read_volume

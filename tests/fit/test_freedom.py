@@ -10,7 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from helpers.bumpy import bumpy, surfaces
-from holosplat.align.gauge import moved_onto
+from holosplat.align.changes import moved_onto
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.checks import InputError
 from holosplat.fit.pose_refinement import GeometryPrior, PoseRefinement, mean_distance_error, projection, with_alignment

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 import holosplat as hs
-from holosplat.beamline.declared.case import Case
+from holosplat.beamline.declared.declaration import Case
 from holosplat.matter import Matter
 from holosplat.methods import Task
 from holosplat.representations.voxels import VoxelGrid

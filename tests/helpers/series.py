@@ -16,8 +16,7 @@ from holosplat.matter import MaterialPrior
 from holosplat.mesh import TriangleMesh
 from holosplat.scan import Exposures, Scan
 from holosplat.series.folder import SeriesFolder
-from holosplat.series.plan import plan_series
-from holosplat.series.settings import Cut, Settings
+from holosplat.series.plan import Cut, Settings, plan_series
 from holosplat.specimens.mesh_series import MeshSeries
 from holosplat.specimens.red_cells import random_cells
 from holosplat.specimens.scene import MeshScene

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 import holosplat
-from holosplat.beamline.declared import declaration, soft_specimens, specimens
+from holosplat.beamline.declared import declaration, specimens
 from holosplat.checks import InputError
 from holosplat.cli.entry import COMMANDS, command
 from holosplat.materials import DeltaBeta
@@ -58,7 +58,7 @@ NEEDED: dict[str, dict[str, Any]] = {
 }
 NEEDED |= {kind.__name__: {"size": 4e-5} for kind in MATTER.values()}
 """What options without a default are made of here."""
-OF_DECLARATIONS = (declaration, soft_specimens, specimens)
+OF_DECLARATIONS = (declaration, specimens, specimens)
 
 
 CLASS = re.compile(r"^((?:@.*\n)*@dataclass.*\n(?:@.*\n)*)class (\w+).*\n((?:(?:    .*)?\n)*)", re.MULTILINE)

@@ -9,7 +9,7 @@ import pytest
 
 from holosplat.beamline.grow import Growth
 from holosplat.beamline.light import UnevenLight
-from holosplat.beamline.scenes import field_centre
+from holosplat.beamline.simulate import field_centre
 from holosplat.checks import InputError, whole_seed
 from holosplat.cli.options import MaterialOptions
 from holosplat.geometry import Views

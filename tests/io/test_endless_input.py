@@ -20,13 +20,10 @@ from holosplat.io.beams import MOST_VIEWS, read_beams
 from holosplat.io.leftovers import LOCK
 from holosplat.io.lock import sole_writer, writer_of
 from holosplat.io.ome_tiff import read_ome_tiff, write_ome_tiff
-from holosplat.io.pvd import read_pvd
-from holosplat.io.reading import Reading, ends_of, marked, read_angles
-from holosplat.io.snapshots import find_snapshots
-from holosplat.io.stacks import stack_of
+from holosplat.io.pvd import find_snapshots, read_pvd
+from holosplat.io.reading import Reading, Tube, ends_of, marked, read_angles
+from holosplat.io.stacks import all_images, stack_of
 from holosplat.io.table import Table
-from holosplat.io.tiff_guard import all_images
-from holosplat.io.tube import Tube
 from holosplat.io.volume_formats import read_volume_file
 from holosplat.io.vtk import read_meshes
 from holosplat.learning.weights import read_aligned, read_weights
@@ -34,8 +31,7 @@ from holosplat.matter import MaterialPrior
 from holosplat.methods import Gaussians
 from holosplat.ranges import COUNT, with_checked_numbers
 from holosplat.series.folder import PLAN, SeriesFolder
-from holosplat.series.plan import MOST_TIMES, SeriesPlan, Source
-from holosplat.series.settings import Cut, Settings
+from holosplat.series.plan import MOST_TIMES, Cut, SeriesPlan, Settings, Source
 from holosplat.tables import overridden, read_table
 from holosplat.volume import Volume
 from holosplat.workflows.run_folder import RunFolder

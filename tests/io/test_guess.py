@@ -8,8 +8,7 @@ import pytest
 
 from holosplat.checks import InputError
 from holosplat.geometry import Grid
-from holosplat.io.guess import read_guess, write_guess
-from holosplat.io.volumes import read_volume
+from holosplat.io.volumes import read_guess, read_volume, write_guess
 from holosplat.volume import Volume
 
 GRID = Grid((3, 4, 5), (1e-6, 1e-6, 1e-6), (0.0, 1e-6, 2e-6))

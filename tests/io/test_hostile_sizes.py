@@ -14,7 +14,7 @@ import tifffile
 import torch
 
 from holosplat.beamline.grow import Growth, SeriesFolder
-from holosplat.beamline.poses import Directions
+from holosplat.beamline.misalignment import Directions
 from holosplat.checks import InputError, as_written
 from holosplat.io.guard import read_array, require_inflated
 from holosplat.io.stacks import stack_of
@@ -73,7 +73,7 @@ def test_a_state_has_a_step_ahead(tmp_path, numbers):
 
 def test_strips_unpack_to_what_they_declare(tmp_path, monkeypatch):
     """A deflated strip of an image of a few pixels that would fill the memory."""
-    monkeypatch.setattr("holosplat.io.tiff_guard.SMALL", 1000)
+    monkeypatch.setattr("holosplat.io.stacks.SMALL", 1000)
     path, image = tmp_path / "a.tif", np.zeros((5, 7), dtype=np.float32)
     tifffile.imwrite(path, image, compression="zlib")
     assert np.array_equal(_pages(path, 1)[0], image)

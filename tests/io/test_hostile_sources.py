@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from holosplat.checks import InputError
-from holosplat.io import hdf5_chunks, hdf5_guard, room
+from holosplat.io import hdf5_guard, room
 from holosplat.io.hdf5 import open_hdf5
 
 SHAPE = (3, 5, 7)
@@ -140,9 +140,9 @@ def bomb(path: Path, unpacked: int, **filters: object) -> Path:
 @pytest.fixture
 def no_room(monkeypatch):
     """So little memory that every chunk is looked into."""
-    monkeypatch.setattr(hdf5_chunks, "SMALL", 1000)
-    monkeypatch.setattr(hdf5_chunks, "free_memory", lambda: 1000)
-    monkeypatch.setattr(hdf5_chunks, "PIECE", 1 << 14)
+    monkeypatch.setattr(hdf5_guard, "SMALL", 1000)
+    monkeypatch.setattr(hdf5_guard, "free_memory", lambda: 1000)
+    monkeypatch.setattr(hdf5_guard, "PIECE", 1 << 14)
 
 
 @pytest.mark.parametrize("filters", [{}, {"shuffle": True}])
@@ -158,7 +158,7 @@ def test_chunks_unpack_to_no_more_than_they_declare(folder, no_room, filters):
 
 
 def test_what_cannot_exceed_memory_is_not_unpacked_twice(folder, monkeypatch):
-    monkeypatch.setattr(hdf5_chunks, "_require_unpacked", lambda *_: pytest.fail("unpacked"))
+    monkeypatch.setattr(hdf5_guard, "_require_unpacked", lambda *_: pytest.fail("unpacked"))
     with open_hdf5(bomb(folder / "a.h5", 5 * CHUNK[0] * CHUNK[1])):
         pass
 

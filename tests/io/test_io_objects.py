@@ -17,8 +17,7 @@ import torch
 
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
-from holosplat.io.gaussians import read_gaussians
-from holosplat.io.objects import FORMAT, read_object, write_object
+from holosplat.io.objects import FORMAT, read_gaussians, read_object, write_object
 from holosplat.matter import Matter
 from holosplat.representations import (
     KINDS,

@@ -14,7 +14,7 @@ from helpers.odd_files import SHAPE, N, a_scan
 from holosplat.checks import InputError, MissingError
 from holosplat.io.formats import read_as
 from holosplat.io.hdf5 import open_hdf5
-from holosplat.io.hdf5_filters import filters_missing_in
+from holosplat.io.hdf5_guard import filters_missing_in
 from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.io.reading import Reading, Told
 
@@ -119,7 +119,7 @@ def test_filters_that_are_plugins_are_named(tmp_path, monkeypatch):
     path = tmp_path / "scan.nxs"
     write_scan(path, a_scan())
     monkeypatch.setitem(sys.modules, "hdf5plugin", None)
-    monkeypatch.setattr("holosplat.io.hdf5_filters.h5z.filter_avail", lambda code: False)
+    monkeypatch.setattr("holosplat.io.hdf5_guard.h5z.filter_avail", lambda code: False)
     assert "fletcher32 (number 3)" in filters_missing_in(path)
     monkeypatch.setattr(h5py.Dataset, "__getitem__", lambda *_: (_ for _ in ()).throw(OSError("no filter")))
     with pytest.raises(MissingError, match=r"filters that HDF5 does not have here: fletcher32 .*holosplat\[codecs\]"):

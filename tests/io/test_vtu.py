@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from holosplat.checks import InputError
+from holosplat.io.vti import write_vtu
 from holosplat.io.vtk import read_meshes
-from holosplat.io.vtu import write_vtu
 from holosplat.matter import DeltaBeta, Matter
 from holosplat.mesh import TriangleMesh
 from holosplat.specimens.red_cells import icosphere

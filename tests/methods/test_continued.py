@@ -10,7 +10,7 @@ import torch
 
 from helpers.moving_ellipsoids import true_paths
 from holosplat.beamline.simulate import simulate
-from holosplat.bodies.moments import moments
+from holosplat.bodies.rest_shape import moments
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
 from holosplat.io.objects import write_object

@@ -19,7 +19,7 @@ from holosplat.methods import SmoothVolume, Task, sharp_level
 from holosplat.methods.sharp_level import material_of_levels
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens import MeshScene
-from holosplat.specimens.capsules import place_capsules
+from holosplat.specimens.phantoms import place_capsules
 
 PIXEL = 1e-6
 WATER = DeltaBeta(6e-7, 4e-10)

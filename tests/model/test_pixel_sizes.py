@@ -23,8 +23,7 @@ from holosplat.representations import Encoding, GaussianCloud, Network, NeuralFi
 from holosplat.representations.gaussians import raw_of
 from holosplat.scan import Exposures
 from holosplat.specimens.red_cells import icosphere
-from holosplat.specimens.scene import MeshScene
-from holosplat.specimens.voxel_scene import VoxelScene
+from holosplat.specimens.scene import MeshScene, VoxelScene
 from holosplat.volume import LineIntegrals, Object, Volume
 
 PIXEL, SHAPE = 1e-6, (23, 29)

@@ -13,8 +13,8 @@ from holosplat.matter import Matter
 from holosplat.mesh import TriangleMesh
 from holosplat.metrics.volumes import normal_distance
 from holosplat.motion.assimilate import Assimilation, _Fit, assimilate
-from holosplat.motion.cell_flow import Unknowns
 from holosplat.motion.cell_model import CellModel, ChannelFrame
+from holosplat.motion.membrane_fit import Unknowns
 from holosplat.specimens.red_cells import RedCell, icosphere
 
 MATERIAL = hs.materials.HAEMOGLOBIN.delta_beta(20.0)

@@ -9,13 +9,13 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from holosplat.bodies.moments import moments
+from holosplat.bodies.rest_shape import moments
 from holosplat.checks import InputError
 from holosplat.mesh import TriangleMesh
 from holosplat.metrics.volumes import normal_distance
-from holosplat.motion.cell_flow import CellFlow, Unknowns, advanced
 from holosplat.motion.cell_model import CellModel, ChannelFrame
 from holosplat.motion.dynamics import whole_cells
+from holosplat.motion.membrane_fit import CellFlow, Unknowns, advanced
 from holosplat.specimens.flow.channel import Channel
 from holosplat.specimens.flow.suspension import Medium
 from holosplat.specimens.membrane.model import Elasticity, Membrane

@@ -10,7 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import holosplat as hs
-from holosplat.bodies.moments import centroid
+from holosplat.bodies.rest_shape import centroid
 from holosplat.checks import InputError
 from holosplat.fit.schedule import Schedule
 from holosplat.matter import Matter
@@ -18,7 +18,7 @@ from holosplat.mesh import TriangleMesh
 from holosplat.metrics.volumes import normal_distance
 from holosplat.motion.fit import MotionFit
 from holosplat.motion.forecast import PathForecast, across, extrapolate, normals
-from holosplat.motion.split_half_errors import half_sets
+from holosplat.motion.measures import half_sets
 from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.specimens.red_cells import icosphere
 

@@ -10,8 +10,7 @@ import torch
 
 import holosplat as hs
 from helpers.motion_shadows import FLOW, OTHER, RADIUS, TURN, cell, pose, shadows
-from holosplat.bodies.moments import centroid
-from holosplat.bodies.rest_shape import KnownBody
+from holosplat.bodies.rest_shape import KnownBody, centroid
 from holosplat.checks import InputError
 from holosplat.cli.track import BodyFlags
 from holosplat.materials import HAEMOGLOBIN

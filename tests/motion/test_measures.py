@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from holosplat.bodies.cut import is_cut
-from holosplat.bodies.moments import centroid, moments
+from holosplat.bodies.rest_shape import centroid, is_cut, moments
 from holosplat.geometry import Views
 from holosplat.matter import Matter
 from holosplat.mesh import TriangleMesh

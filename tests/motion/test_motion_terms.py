@@ -9,7 +9,7 @@ import torch
 from helpers.moving_ellipsoids import MATERIAL, PIXEL, true_paths, truth
 from holosplat.fit.problem import Batch
 from holosplat.matter import Matter
-from holosplat.motion.terms import Acceleration, Apart, MovingBending, area_kept, square_root, volume_kept
+from holosplat.motion.elastic import Acceleration, Apart, MovingBending, area_kept, square_root, volume_kept
 from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.representations.isosurface import neighbour_mean
 from holosplat.specimens.red_cells import icosphere

@@ -15,8 +15,7 @@ from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta, MaterialPrior, Matter
 from holosplat.methods import SmoothVolume, Task
 from holosplat.motion.flow_reconstruction import MOTION, STILL, FlowOptions, FlowSearch
-from holosplat.motion.freer_flow import of_degree, on_lattice
-from holosplat.motion.timed_frames import merged
+from holosplat.motion.timed_frames import merged, of_degree, on_lattice
 from holosplat.representations import Flow, Lattice, TimeBasis, VoxelGrid
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.carried import CarriedScene

@@ -9,7 +9,7 @@ from scipy.ndimage import label
 from helpers.moving_ellipsoids import MATERIAL as OTHER
 from helpers.moving_ellipsoids import scan as of_ellipsoids
 from holosplat.beamline.simulate import simulate
-from holosplat.bodies.cut import parted
+from holosplat.bodies.rest_shape import parted
 from holosplat.geometry import Views
 from holosplat.learning.start import LearnedStart
 from holosplat.materials import HAEMOGLOBIN

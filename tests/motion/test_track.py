@@ -10,26 +10,26 @@ import pytest
 import torch
 
 from helpers.moving_ellipsoids import BODIES, MATERIAL, PIXEL, STEP, TIMES, scan, true_paths, truth
-from holosplat.bodies.moments import centroid
+from holosplat.bodies.rest_shape import centroid
 from holosplat.checks import InputError
 from holosplat.fit.schedule import Schedule
 from holosplat.geometry import Grid
 from holosplat.matter import Matter
 from holosplat.metrics import volume_scores
 from holosplat.motion import body_tracker
-from holosplat.motion.detections import sightings
-from holosplat.motion.fit import MotionFit, motion_fit
-from holosplat.motion.pieces import PathOptions, chosen_paths, refined
-from holosplat.motion.residual_detection import (
+from holosplat.motion.detections import (
     apart,
     beside,
     joined,
     only,
     shared,
+    sightings,
     sure_ones,
     whole_ones,
     without_merger,
 )
+from holosplat.motion.fit import MotionFit, motion_fit
+from holosplat.motion.pieces import PathOptions, chosen_paths, refined
 from holosplat.motion.track import TrackOptions, follow
 from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.specimens.red_cells import icosphere

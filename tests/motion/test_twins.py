@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 import holosplat as hs
 from helpers.motion_shadows import OTHER, TURN, cell
-from holosplat.bodies.moments import moments
-from holosplat.bodies.twin import map_near, twin_map, twin_of
+from holosplat.bodies.poses import map_near, twin_map, twin_of
+from holosplat.bodies.rest_shape import moments
 from holosplat.fit.running import Steps
 from holosplat.fit.schedule import Schedule
 from holosplat.geometry import rotation_y

@@ -21,7 +21,7 @@ from holosplat.motion.flow_reconstruction import FlowOptions
 from holosplat.motion.track_options import TrackOptions
 from holosplat.planning import acts
 from holosplat.planning.needs import Needs, Sizes, of_fit, of_reconstruction
-from holosplat.planning.smaller import coarser
+from holosplat.planning.scan_facts import coarser
 from holosplat.scan import Exposures
 from holosplat_bench.suite.methods import of_benchmark, of_methods
 

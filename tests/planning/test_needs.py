@@ -26,7 +26,7 @@ from holosplat.planning.needs import (
     of_simulation,
     require_room,
 )
-from holosplat.planning.smaller import smaller
+from holosplat.planning.scan_facts import smaller
 from holosplat.scan import Exposures
 
 DATA = Path(__file__).resolve().parents[2] / "docs/data"

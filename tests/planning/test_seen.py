@@ -15,9 +15,9 @@ from holosplat.matter import Matter
 from holosplat.methods import METHODS, Auto
 from holosplat.model import measure
 from holosplat.optics.detector import poisson
-from holosplat.planning import seen as looking
+from holosplat.planning import scan_facts as looking
 from holosplat.planning.needs import UNSEEN, Needs, Seen, Sizes, of_choice, of_reconstruction
-from holosplat.planning.seen import seen_of
+from holosplat.planning.scan_facts import seen_of
 from holosplat.representations import SurfaceMesh
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.red_cells import evans_fung_cell

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from holosplat.report.forecast_shown import ForecastShown, forecast_block, forecast_figure
+from holosplat.report.surface import ForecastShown, forecast_block, forecast_figure
 
 TIMES = 1e-5 * np.arange(1, 5)
 BAND = 1e-7 * np.outer(np.arange(1, 5), [1.0, 2.0, np.nan])

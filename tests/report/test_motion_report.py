@@ -14,7 +14,7 @@ import torch
 from PIL import Image
 
 from helpers.moving_ellipsoids import PIXEL, STEP, TIMES, scan, true_paths, truth
-from holosplat.bodies.moments import centroid
+from holosplat.bodies.rest_shape import centroid
 from holosplat.geometry import Grid, Views
 from holosplat.matter import Matter
 from holosplat.mesh import TriangleMesh

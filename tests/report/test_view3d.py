@@ -18,9 +18,8 @@ from helpers.splats import cloud
 from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta, Matter
 from holosplat.model import Instrument
-from holosplat.report.view3d import parts as packing
-from holosplat.report.view3d.parts import ViewPart, binned, part_of, volume_part
-from holosplat.report.view3d.view import View3D, html, packed, raster_of
+from holosplat.report.view3d import view as packing
+from holosplat.report.view3d.view import View3D, ViewPart, binned, html, packed, part_of, raster_of, volume_part
 from holosplat.representations import GaussianCloud, MovingSurfaces, SurfaceMesh
 from holosplat.representations.gaussians import raw_of
 from holosplat.representations.paths import TimeBasis

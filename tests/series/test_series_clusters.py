@@ -18,8 +18,8 @@ from holosplat.checks import InputError, MissingError
 from holosplat.io.json import write_json
 from holosplat.series import run as running
 from holosplat.series.folder import FAILED, SeriesFolder
+from holosplat.series.plan import Slurm
 from holosplat.series.run import Counts, ranges_of, run_on_dask, run_processes, script_of
-from holosplat.series.settings import Slurm
 
 
 @pytest.fixture

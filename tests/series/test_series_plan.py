@@ -15,10 +15,9 @@ from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import Auto
 from holosplat.motion.track import TrackOptions
 from holosplat.optics.background import LightOptions
-from holosplat.series.appearing import listed
 from holosplat.series.folder import SeriesFolder
-from holosplat.series.plan import SeriesPlan, Source, plan_series
-from holosplat.series.settings import Cut, Settings, prior_of
+from holosplat.series.plan import Cut, SeriesPlan, Settings, Source, plan_series, prior_of
+from holosplat.series.watch import listed
 
 CELL = HAEMOGLOBIN.delta_beta(20.0)
 

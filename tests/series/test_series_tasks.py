@@ -22,8 +22,8 @@ from holosplat.methods import HolographicVoxels
 from holosplat.methods.continued import Continued
 from holosplat.series import time as series_time
 from holosplat.series.folder import SeriesFolder
+from holosplat.series.plan import Settings
 from holosplat.series.run import run_left, states
-from holosplat.series.settings import Settings
 from holosplat.series.task import attempted, run_task
 from holosplat.workflows.run_folder import RunFolder
 

@@ -14,8 +14,7 @@ from helpers.series import SETTINGS, known
 from holosplat.checks import InputError
 from holosplat.io.reading import Reading
 from holosplat.series import watch as watching
-from holosplat.series.appearing import Folder
-from holosplat.series.watch import Watch, WatchFolder, Watching
+from holosplat.series.watch import Folder, Watch, WatchFolder, Watching
 
 
 class World:

@@ -23,8 +23,7 @@ from holosplat.representations import GaussianCloud, MovingSurfaces, SurfaceMesh
 from holosplat.representations.gaussians import raw_of
 from holosplat.show import server
 from holosplat.show.parts import Frame, Splats, at_times, cut, shown
-from holosplat.show.server import Guard, LiveView
-from holosplat.show.watch import Watch
+from holosplat.show.server import Guard, LiveView, Watch
 from holosplat.specimens.red_cells import icosphere
 
 MATTER = Matter((DeltaBeta(4e-7, 2e-10),))

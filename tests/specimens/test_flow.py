@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from holosplat.checks import InputError
-from holosplat.specimens.flow.channel import Channel
-from holosplat.specimens.flow.contacts import Repulsion, contact_forces, wall_forces
+from holosplat.specimens.flow.channel import Channel, Repulsion, contact_forces, wall_forces
 from holosplat.specimens.flow.suspension import (
     BLOB,
     CHUNK,

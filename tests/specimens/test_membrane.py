@@ -11,12 +11,10 @@ from scipy.integrate import quad
 
 from holosplat.checks import InputError
 from holosplat.mesh import TriangleMesh
-from holosplat.specimens.membrane import energies
-from holosplat.specimens.membrane.geometry import elongation, gyration_axes, shape_change
-from holosplat.specimens.membrane.model import Elasticity, Membrane
-from holosplat.specimens.membrane.rest import RestShape
+from holosplat.specimens.membrane import model
+from holosplat.specimens.membrane.model import Elasticity, Membrane, stretch
+from holosplat.specimens.membrane.rest import RestShape, elongation, gyration_axes, shape_change
 from holosplat.specimens.membrane.resting import geodesic_sphere, resting_cell
-from holosplat.specimens.membrane.tweezers import stretch
 from holosplat.specimens.red_cells import RedCell, icosphere
 
 NOTHING = Elasticity(**{field.name: 0.0 for field in fields(Elasticity)})
@@ -97,17 +95,17 @@ def test_energies_of_a_sphere_blown_up(ratio):
         return (s**0.5 + s**-2.5) / (s + s**-3)
 
     wanted = {
-        energies.stretching_energy: square * quad(lambda s: kappa(s) * (s - 1), 1, ratio)[0],
-        energies.linear_energy: square * 0.5 * (ratio - 1) ** 2,
-        energies.local_area_energy: surface * 0.5 * (ratio**2 - 1) ** 2,
-        energies.global_area_energy: surface * 0.5 * (ratio**2 - 1) ** 2,
-        energies.volume_energy: volume * 0.5 * (ratio**3 - 1) ** 2,
-        energies.bending_energy: 0.0,
+        model.stretching_energy: square * quad(lambda s: kappa(s) * (s - 1), 1, ratio)[0],
+        model.linear_energy: square * 0.5 * (ratio - 1) ** 2,
+        model.local_area_energy: surface * 0.5 * (ratio**2 - 1) ** 2,
+        model.global_area_energy: surface * 0.5 * (ratio**2 - 1) ** 2,
+        model.volume_energy: volume * 0.5 * (ratio**3 - 1) ** 2,
+        model.bending_energy: 0.0,
     }
     for energy, value in wanted.items():
         assert float(energy(nodes, rest, 1.0)) == pytest.approx(value, rel=1e-9, abs=1e-24), energy.__name__
     skalak = 0.25 * surface * (one**2 + 2 * one - 2 * two + 3.0 * two**2)
-    assert float(energies.skalak_energy(nodes, rest, 1.0, 3.0)) == pytest.approx(skalak, rel=1e-9, abs=1e-24)
+    assert float(model.skalak_energy(nodes, rest, 1.0, 3.0)) == pytest.approx(skalak, rel=1e-9, abs=1e-24)
 
 
 def test_skalaks_shear_modulus():
@@ -118,8 +116,8 @@ def test_skalaks_shear_modulus():
     errors = []
     for e in (2e-2, 1e-2):
         pulled = corner[rest.faces[:1]] * torch.tensor([1 + e, 1 / (1 + e), 1.0]).double()
-        gradient = energies.deformation_gradient(pulled, replace(rest, frame=rest.frame[:1]))
-        one, two = energies.strain_invariants(gradient)
+        gradient = model.deformation_gradient(pulled, replace(rest, frame=rest.frame[:1]))
+        one, two = model.strain_invariants(gradient)
         density = 0.25 * (one**2 + 2 * one - 2 * two + 5.0 * two**2)
         errors.append(abs(float(density) / (2 * e**2) - 1))
     assert errors[1] < 0.02
@@ -133,7 +131,7 @@ def test_bending_of_a_sphere():
         mesh = sphere(frequency)
         rest = RestShape.of(mesh)
         flat = replace(rest, angle=torch.zeros_like(rest.angle))
-        found.append(float(energies.bending_energy(torch.from_numpy(mesh.vertices.copy()), flat, 1.0)))
+        found.append(float(model.bending_energy(torch.from_numpy(mesh.vertices.copy()), flat, 1.0)))
     assert np.allclose(found, 4 * np.pi / 3**0.5, rtol=0.03)
     assert float(rest.angle.min()) > 0  # convex is positive
 

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from holosplat.beamline.scenes import Filling
 from holosplat.beamline.series import SeriesFiles, Timing, held_out, read_series
-from holosplat.beamline.simulate import Shutter
+from holosplat.beamline.simulate import Filling, Shutter
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
-from holosplat.io.snapshots import find_snapshots
+from holosplat.io.pvd import find_snapshots
 from holosplat.io.vtk import read_meshes, write_mesh
 from holosplat.materials import DeltaBeta
 from holosplat.mesh import TriangleMesh

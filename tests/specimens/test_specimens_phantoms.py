@@ -9,9 +9,15 @@ from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
 from holosplat.materials import DeltaBeta
 from holosplat.specimens import red_cells
-from holosplat.specimens.capsules import Capsule, place_capsules
-from holosplat.specimens.foam import random_foam
-from holosplat.specimens.phantoms import Ball, packed_balls, star_of_balls, unit_ball
+from holosplat.specimens.phantoms import (
+    Ball,
+    Capsule,
+    packed_balls,
+    place_capsules,
+    random_foam,
+    star_of_balls,
+    unit_ball,
+)
 from holosplat.specimens.red_cells import crowded_cells, evans_fung_cell, icosphere, place_cells
 from holosplat.specimens.repair import closed
 from holosplat.specimens.scene import MeshScene

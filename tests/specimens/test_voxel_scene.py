@@ -9,7 +9,7 @@ from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views, rotation_tilted
 from holosplat.matter import DeltaBeta
 from holosplat.specimens.continuous import Bump, ContinuousScene, ellipsoid
-from holosplat.specimens.voxel_scene import VoxelScene
+from holosplat.specimens.scene import VoxelScene
 from holosplat.volume import Volume
 
 MATTER = DeltaBeta(2e-7, 1e-10)

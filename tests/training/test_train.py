@@ -19,9 +19,8 @@ from holosplat.training.folder import Dataset
 from holosplat.training.options import LossWeights, TrainOptions, ViewSampling
 from holosplat.training.ranges import Ranges
 from holosplat.training.sample import Sample
-from holosplat.training.shown import dice, example_of_views, loss, soft_dice
+from holosplat.training.shown import Validation, dice, example_of_views, loss, soft_dice
 from holosplat.training.train import Training
-from holosplat.training.validate import Validation
 
 OPTIONS = TrainOptions(
     steps=6,

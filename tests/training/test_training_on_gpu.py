@@ -23,8 +23,8 @@ from holosplat.training.folder import Dataset
 from holosplat.training.options import FrameLossWeights, TrainOptions, ViewSampling
 from holosplat.training.ranges import Ranges
 from holosplat.training.sample import Sample
+from holosplat.training.shown import Validation
 from holosplat.training.train import Training
-from holosplat.training.validate import Validation
 
 pytest.importorskip("triton")
 

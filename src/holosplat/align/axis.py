@@ -15,8 +15,7 @@ from ..optics.background import LightOptions
 from ..progress import Advance
 from ..ranges import ranged
 from ..scan import Exposures, Scan
-from .consistency import Consistency, Estimate, Sinograms, combined
-from .half_turn import HalfTurn, ends_of, half_turn, may_be_half
+from .consistency import Consistency, Estimate, HalfTurn, Sinograms, combined, ends_of, half_turn, may_be_half
 from .shadows import EVEN_OR_NOT, shadows
 
 STEP = 0.25

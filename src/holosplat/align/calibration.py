@@ -19,9 +19,8 @@ from ..optics.sampling import fringe_sampling
 from ..progress import Progress
 from ..ranges import Pixels, ranged
 from ..scan import Exposures, Scan
-from .changes import changes, header, line
+from .changes import changes, header, line, moved_onto
 from .derivatives import NUMBERS
-from .gauge import moved_onto
 from .initial_geometry import shifts_by_mass
 from .newton import unexplained
 from .phantom import STEPS, Linear, Phantom, find_beads, linearised, placed, solved

@@ -1,12 +1,15 @@
-"""Changes of views from their plan: as numbers, in words and in tables."""
+"""Changes of views from their plan, as numbers, words and tables; the common motion that no frame determines."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from ..geometry import Views
 from ..scan import Exposures
 
 
@@ -49,3 +52,17 @@ def line(number: int, change: np.ndarray, error: np.ndarray, digits: int, *last:
     shifts = [f"{change[k]:+{digits + 4}.{digits}f} ± {error[k]:.{digits}f}" for k in (0, 1)]
     turns = [f"{change[k]:+{digits + 4}.{digits + 1}f}° ± {error[k]:.{digits + 1}f}" for k in (2, 3, 4)]
     return "  ".join([f"{number:4d}", *shifts, *turns, *last])
+
+
+def moved_onto(found: Views, planned: Views) -> Views:
+    """`found` with the object turned and moved so that its views are as near to `planned` as can be.
+
+    The common turn is the mean of all relative ones, the common motion the least-squares one: mean turn and mean shift
+    of the views are then zero. Frames stay what they are.
+    """
+    turns = np.einsum("vji,vjk->vik", found.rotations, planned.rotations)
+    rotations = found.rotations @ Rotation.from_matrix(turns).mean().as_matrix()
+    design = rotations[:, :2].reshape(-1, 3)
+    away = (found.shifts - planned.shifts).reshape(-1)
+    motion = np.linalg.lstsq(design, away, rcond=1e-9)[0]
+    return replace(found, rotations=rotations, shifts=found.shifts - (design @ motion).reshape(-1, 2))

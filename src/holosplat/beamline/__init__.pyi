@@ -2,11 +2,11 @@ from .grow import Growth as Growth
 from .light import UnevenLight as UnevenLight
 from .misalignment import Misalignment as Misalignment
 from .record import RecordingOptions as RecordingOptions
-from .scenes import Filling as Filling
-from .scenes import read_scene as read_scene
 from .series import SeriesFiles as SeriesFiles
 from .series import Timing as Timing
 from .series import read_series as read_series
+from .simulate import Filling as Filling
 from .simulate import Shutter as Shutter
 from .simulate import Simulation as Simulation
+from .simulate import read_scene as read_scene
 from .simulate import simulated_frames as simulated_frames

@@ -12,8 +12,7 @@ from torch import Tensor
 
 from ..checks import InputError, as_written, in_range, require
 from ..fit.running import interrupts_held
-from ..io.atomic import atomic_path
-from ..io.folder import require_new
+from ..io.atomic import atomic_path, require_new
 from ..io.guard import read_archive
 from ..io.json import read_json, write_json
 from ..io.pvd import TimeStep, write_pvd

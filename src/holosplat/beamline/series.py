@@ -10,13 +10,12 @@ from typing import Literal
 import numpy as np
 
 from ..checks import in_range, require
-from ..io.snapshots import find_snapshots
+from ..io.pvd import find_snapshots
 from ..progress import Advance
 from ..ranges import Frequency, Seconds, Signed, Weight, ranged
 from ..specimens.mesh_series import ROUNDING, MeshSeries
 from ..units import LENGTH_UNITS, unit_factor
-from .scenes import Filling, field_centre, filled_scene
-from .simulate import Shutter
+from .simulate import Filling, Shutter, field_centre, filled_scene
 
 FRAME_RATE_RANGE = (1e-6, 1e12)
 MOST_TIMES = 1_000_000
@@ -94,7 +93,7 @@ def read_series(
 ) -> tuple[MeshSeries, np.ndarray]:
     """The moving bodies, filled and centred, and the times [T] of the frames [s], of which the first is 0.
 
-    Only the snapshots that the frames need are read (`io.snapshots.find_snapshots` says how files are named). Errors:
+    Only the snapshots that the frames need are read (`io.pvd.find_snapshots` says how files are named). Errors:
     `InputError` for files that cannot be read, bodies that change their triangles or jump (`MeshSeries`), and times
     beyond the snapshots. `on_progress(fraction)` is called after each snapshot.
     """

@@ -12,10 +12,9 @@ from ..fit.running import Steps
 from ..matter import DeltaBeta
 from ..mesh import TriangleMesh
 from ..scan import Scan
-from .moments import moments, stretched_like
 from .neighbourhood_search import Heard, pursued
 from .poses import FREER, Explained, Pose
-from .rest_shape import KnownBody
+from .rest_shape import KnownBody, moments, stretched_like
 from .shadows import Shadows
 
 SEARCH_RADIUS = 2.8

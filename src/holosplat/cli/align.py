@@ -12,11 +12,10 @@ from tyro.conf import Positional
 from ..checks import require
 from ..io.reading import Part, Reading
 from ..ranges import ranged
-from .light import LightFlags
+from .light import Degrees, LightFlags, Pixels, Share
 from .options import PriorOptions
 from .places import Output
 from .progress import ProgressBar
-from .quantities import Degrees, Pixels, Share
 from .room import tell_frames
 
 if TYPE_CHECKING:

@@ -12,11 +12,10 @@ from tyro.conf import Positional
 from ..checks import require
 from ..io.reading import Part, Reading
 from ..ranges import Small, ranged
-from .light import LightFlags
+from .light import Degrees, LightFlags, Pixels, Share
 from .options import MaterialOptions
 from .places import Output
 from .progress import ProgressBar
-from .quantities import Degrees, Pixels, Share
 
 if TYPE_CHECKING:
     from ..align import Calibrated, CalibrationOptions

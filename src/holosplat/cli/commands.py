@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -21,12 +20,13 @@ from .options import BeamlineOptions, MethodOptions, PriorOptions
 from .places import Output
 from .progress import INTERRUPTED, ProgressBar
 from .room import tell_frames, tell_reconstruction
+from .sentence import say
 from .truth import TruthOptions
 
 if TYPE_CHECKING:
     from ..methods import Method
     from ..scan import Scan
-    from ..series.settings import Settings
+    from ..series.plan import Settings
     from ..workflows.evaluate import Evaluation
     from ..workflows.reconstruct import Reconstruction
     from ..workflows.run_folder import RunFolder
@@ -50,7 +50,7 @@ class Asked:
 
     def each_time(self, method: Method, reading: Reading, seed: int) -> Settings:
         """What is done with each of several times; `InputError` for what one time alone can be asked."""
-        from ..series.settings import Settings
+        from ..series.plan import Settings
 
         require(self.geometry.options() is None, "--refine is of one time; find the one geometry by holosplat align.")
         ranges = [*self.matter.ranges(), *reading.told.ranges()]
@@ -110,7 +110,7 @@ def reconstruct(
     from ..methods import Pinn
     from ..methods.uncertain import Uncertain
     from ..planning.acts import of_space_time
-    from ..planning.seen import can_be_seen
+    from ..planning.scan_facts import can_be_seen
     from ..workflows.reconstruct import reconstruct as fit
     from ..workflows.run_folder import RunFolder, claimed
     from .motion import asks_for_motion, may_go_on, reconstruct_in_motion
@@ -187,9 +187,9 @@ def _end(result: Reconstruction, out: Path, strict: bool) -> None:
     """Warn of what is not explained or not finished; exit with 3 or 130 where that is so."""
     unexplained = result.verdict is not None and not result.verdict.good
     if unexplained:
-        _say("warning: the frames are not explained; do not trust the volume before the cause is found")
+        say("warning: the frames are not explained; do not trust the volume before the cause is found")
     if not result.finished:
-        _say(f"interrupted, but {out} is usable; go on with --resume")
+        say(f"interrupted, but {out} is usable; go on with --resume")
         raise SystemExit(INTERRUPTED)
     if strict and unexplained:
         raise SystemExit(UNEXPLAINED)
@@ -200,14 +200,14 @@ def _print_result(folder: RunFolder, result: Reconstruction, report: Path) -> No
     from ..io.json import read_json
 
     if folder.light.is_file():
-        _say(f"light: {read_json(folder.summary)['light']} ({folder.light})")
+        say(f"light: {read_json(folder.summary)['light']} ({folder.light})")
     for constant in result.constants:
         print(constant.line())
     for line in result.geometry.lines() if result.geometry else ():
         print(line)
     for line in result.choice.lines():
         print(line)
-    _say(f"{sum(result.timing.values()):.1f} s, {result.object.described}; report: {report}")
+    say(f"{sum(result.timing.values()):.1f} s, {result.object.described}; report: {report}")
     for line in result.verdict.lines("training frames") if result.verdict else ():
         print(line)
     if result.total:
@@ -242,7 +242,7 @@ def render(
     require(len(chosen) > 0, f"{scan} has no {split} frames to render; choose another --split.")
     frames = predict(result, chosen.exposures)
     write_scan(out, Scan(frames, chosen.exposures, chosen.is_test, {"rendered_from": run.name}))
-    _say(f"wrote {out}: {len(frames)} predicted frames")
+    say(f"wrote {out}: {len(frames)} predicted frames")
 
 
 def evaluate(
@@ -285,10 +285,10 @@ def evaluate(
     if instants_of(folder):
         return  # its report is of the time in the middle
     if not folder.is_of(scan_hash(measured)):
-        _say("this is not the scan that was reconstructed, its frames may have been fitted; report unchanged")
+        say("this is not the scan that was reconstructed, its frames may have been fitted; report unchanged")
     elif true_volume is not None or not folder.report.exists():
         with claimed(folder):
-            _say(f"report: {report_run(folder, result, measured, evaluation, true_volume)}")
+            say(f"report: {report_run(folder, result, measured, evaluation, true_volume)}")
 
 
 def demo(out: Output = Path("demo")) -> None:
@@ -303,16 +303,14 @@ def demo(out: Output = Path("demo")) -> None:
     meshes, scan, truth, run = out / "meshes", out / "scan.nxs", out / "truth.h5", out / "run"
     meshes.mkdir(parents=True)
     paths = write_demo_meshes(meshes)
-    _say(f"wrote {len(paths)} generated red cells to {meshes}")
+    say(f"wrote {len(paths)} generated red cells to {meshes}")
     detector = "--detector {} {}".format(*DETECTOR)
-    _say(
-        f"\n$ holosplat simulate {meshes}/*.vtk {detector} --views 16 --psf-sigma-px 0.05 --out {scan} --truth {truth}"
-    )
+    say(f"\n$ holosplat simulate {meshes}/*.vtk {detector} --views 16 --psf-sigma-px 0.05 --out {scan} --truth {truth}")
     beamline = BeamlineOptions(DETECTOR, psf_sigma_px=0.05, views=16)
     simulate(tuple(paths), beamline=beamline, out=scan, truth=TruthOptions(truth))
-    _say(f"\n$ holosplat reconstruct {scan} --material haemoglobin --out {run}")
+    say(f"\n$ holosplat reconstruct {scan} --material haemoglobin --out {run}")
     reconstruct(scan, run, Asked(PriorOptions(("haemoglobin",))))
-    _say(f"\n$ holosplat evaluate {run} --truth {truth}")
+    say(f"\n$ holosplat evaluate {run} --truth {truth}")
     evaluate(run, truth=truth)
 
 
@@ -341,7 +339,3 @@ def _auto() -> str:
 def _print_scores(evaluation: Evaluation) -> None:
     for line in evaluation.lines():
         print(line)
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr)

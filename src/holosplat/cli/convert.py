@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -29,6 +28,7 @@ from ..workflows.fixed_pattern import FixedPatternOptions, flatfield_corrected
 from .options import PriorOptions
 from .places import Output
 from .progress import ProgressBar
+from .sentence import say
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class EveningOptions:
         with ProgressBar() as bar:
             options = FixedPatternOptions(self.still_light, self.inside or 0.0)
             found = flatfield_corrected(scan, prior, options, lambda stage, fraction: bar.show(stage, fraction, {}))
-        _say(f"still light: {found.provenance['still_light']}")
+        say(f"still light: {found.provenance['still_light']}")
         return found
 
 
@@ -132,7 +132,7 @@ def convert(
             said["truth"] = read_volume_file(writing.truth)
         write_r2_gaussian(out, scan, *_retrieved(scan, prior), replace(R2Options(), **said))
     held_out = int(scan.is_test.sum())
-    _say(f"wrote {out}: {to}, {len(scan)} frames of {scan.views.shape[0]} × {scan.views.shape[1]} pixels, "
+    say(f"wrote {out}: {to}, {len(scan)} frames of {scan.views.shape[0]} × {scan.views.shape[1]} pixels, "
          f"{held_out} of them held out")  # fmt: skip
 
 
@@ -140,7 +140,7 @@ def _read(source: Path, reading: Reading) -> Scan:
     """The scan at `source`, which may be a folder of another program."""
     scan = read_as(source, reading, joined=False)
     if loader_of(source).name == "r2-gaussian":
-        _say(f"{source} has no phase: transmission exp(-p) in contact, where a density of 1 has beta "
+        say(f"{source} has no phase: transmission exp(-p) in contact, where a density of 1 has beta "
              f"{scan.provenance['beta_of_density_1']}; reconstruct it with --delta-beta 1, and read beta")  # fmt: skip
     return scan
 
@@ -169,8 +169,4 @@ def _say_what_is_cut(scan: Scan) -> None:
     held_out = scan.frames[scan.is_test]
     cut = int(((held_out < low) | (held_out > high)).sum())
     if cut:
-        _say(f"{cut} of {held_out.size} held-out pixels lie beyond the training frames' range and were cut off to it")
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr)
+        say(f"{cut} of {held_out.size} held-out pixels lie beyond the training frames' range and were cut off to it")

@@ -1,4 +1,4 @@
-"""`holosplat data`: public sample data, listed and fetched."""
+"""The commands `info`, `data`, `materials` and `check`: what files are, samples, named materials, checksums."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg, subcommand
 
-from .places import with_checked_arguments
+from ..checks import InputError
+from ..io.reading import Reading
+from ..workflows.check import check as look
+from .places import Output, with_checked_arguments
 
 
 def _list() -> None:
@@ -52,3 +55,57 @@ def data(
     ],
 ) -> None:
     """Sample data of other people: list it, or fetch one into the cache (list, fetch NAME)."""
+
+
+def materials(names: Positional[tuple[str, ...]] = (), energy_kev: float = 20.0) -> None:
+    """List the materials that have a name, with density, δ, β and δ/β; formulas need a density instead.
+
+    Args:
+        names: Only those whose name has one of these texts in it (default: all).
+        energy_kev: Photon energy [keV].
+    """
+    from ..checks import require
+    from ..materials import named_materials
+
+    wanted = [text.lower() for text in names]
+    found = [
+        named
+        for named in named_materials()
+        if not wanted or any(text in name.lower() for text in wanted for name in (named.name, *named.aliases))
+    ]
+    require(
+        len(found) > 0,
+        f"names must be part of the name of a material, but {', '.join(names)} is in none; give none to see all.",
+    )
+    print(f"{'name':34} {'g/cm³':>8} {'δ':>11} {'β':>11} {'δ/β':>7}  source  (at {energy_kev:g} keV)")
+    for named in found:
+        delta, beta = (matter := named.material.delta_beta(energy_kev))
+        name = ", ".join((named.name, *named.aliases))
+        density = named.material.density_g_cm3
+        print(f"{name:34} {density:8.4g} {delta:11.4e} {beta:11.4e} {matter.ratio:7.0f}  {named.source}")
+
+
+def check(path: Positional[Path]) -> None:
+    """Say whether a run folder or an HDF5 file is as it was written, by manifest and checksums.
+
+    Args:
+        path: Run folder, another folder with HDF5 files, or one such file.
+    """
+    count, wrong = look(path)
+    if wrong:
+        raise InputError("; ".join(wrong) + ".")
+    print(f"{path} is as it was written: {count} HDF5 file{'s' if count != 1 else ''} read to the end")
+
+
+def info(path: Positional[Path], picture: Output | None = None, reading: Reading = Reading()) -> None:
+    """Say what a file or a run is: shape, beam, angles, air, noise, fringes, what is missing, and what it takes.
+
+    A few frames are read, and no more. What is missing is said with the option that gives it.
+
+    Args:
+        path: Scan of any format, volume, mesh, object or run folder.
+        picture: PNG file to write: two frames with a scale bar, and their power spectrum with fringes.
+    """
+    from ..report.info import info as described
+
+    print("\n".join(described(path, reading, picture).lines()))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,11 +12,11 @@ from ..io.reading import Reading
 from ..matter import MaterialPrior
 from ..series.collect import collect
 from ..series.folder import SeriesFolder, line_of
-from ..series.plan import plan_series
+from ..series.plan import Cut, Settings, plan_series
 from ..series.run import run_left
-from ..series.settings import Cut, Settings
 from .progress import INTERRUPTED
 from .room import tell_each_time
+from .sentence import say
 from .series import UNFINISHED
 
 
@@ -48,15 +47,11 @@ def reconstruct_each(
     else:
         folder.create(planned)
     try:
-        counts = run_left(folder, retry=True, on_row=lambda row: _say(line_of(row)))
+        counts = run_left(folder, retry=True, on_row=lambda row: say(line_of(row)))
     except KeyboardInterrupt:
-        _say(f"interrupted; go on with --out {out} --resume")
+        say(f"interrupted; go on with --out {out} --resume")
         raise SystemExit(INTERRUPTED) from None
     collect(folder)
-    _say(f"wrote {folder.table}, {folder.page}; each time is a run folder in {folder.task(0)}")
+    say(f"wrote {folder.table}, {folder.page}; each time is a run folder in {folder.task(0)}")
     if counts.failed or counts.left:
         raise SystemExit(UNFINISHED)
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr)

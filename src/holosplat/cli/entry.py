@@ -21,12 +21,10 @@ from ..plugins import Extended
 from ..ranges import checked_later
 from ..version import __version__
 from .help import ALL, CONFIG, HELP, acts_of, overview, page, parser_of
-from .log import logged
 from .places import with_checked_arguments
-from .progress import INTERRUPTED, say_notes
+from .progress import INTERRUPTED, end_as_on_interrupt, logged, say_notes
 from .resume import resumed
 from .sentence import give_up
-from .signals import end_as_on_interrupt
 
 LONGEST = 200
 """Characters of another program's message, at most."""
@@ -40,7 +38,7 @@ _OWN: dict[str, tuple[str, str]] = {
         "Say what an experiment would see, resolve and store, and where its best distance and energy lie.",
     ),
     "materials": (
-        "materials",
+        "data",
         "List the materials that have a name, with density, δ, β and δ/β; formulas need a density instead.",
     ),
     "grow": ("grow", "Let red cells flow through a channel, and write their meshes (VTK, µm) at every snapshot."),
@@ -111,7 +109,7 @@ _OWN: dict[str, tuple[str, str]] = {
         "Compare two runs side by side: what was asked, decided and found, and where their volumes differ.",
     ),
     "check": (
-        "check",
+        "data",
         "Say whether a run folder or an HDF5 file is as it was written, by manifest and checksums.",
     ),
     "data": ("data", "Sample data of other people: list it, or fetch one into the cache (list, fetch NAME)."),
@@ -125,7 +123,7 @@ _OWN: dict[str, tuple[str, str]] = {
     ),
     "demo": ("commands", "Run the whole chain on generated red cells: simulate, reconstruct, evaluate, report."),
     "info": (
-        "info",
+        "data",
         "Say what a file or a run is: shape, beam, angles, air, noise, fringes, what is missing, and what it takes.",
     ),
     "doctor": (

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ from tyro.conf import Positional
 from ..checks import InputError, as_written, in_range, require
 from ..ranges import Pixels, ranged
 from .places import Output
+from .sentence import say
 
 if TYPE_CHECKING:
     from ..geometry import Grid
@@ -108,7 +108,7 @@ def export(
     for path in timed if every else ():
         _export_series(path, steps[path], grid, contents)
     if contents.mu_per_beta is not None:
-        _say("δ is not told, for the frames show absorption alone: the attenuation coefficient µ stands in its place")
+        say("δ is not told, for the frames show absorption alone: the attenuation coefficient µ stands in its place")
 
 
 def _require_suffixes(volume: Path | None, bodies: Path | None, objects: ObjectFiles) -> None:
@@ -146,8 +146,8 @@ def _require_free(timed: Sequence[Path], every: Sequence[int]) -> None:
 
 def _export_series(path: Path, steps: Sequence[tuple[float, Path]], grid: Grid | None, of: Contents) -> None:
     """Write what opens files of all times, if their format has such."""
+    from ..io.plain_values import write_xdmf
     from ..io.pvd import TimeStep, write_pvd
-    from ..io.xdmf import write_xdmf
 
     suffix = SERIES.get(path.suffix.lower())
     if suffix is None:
@@ -158,7 +158,7 @@ def _export_series(path: Path, steps: Sequence[tuple[float, Path]], grid: Grid |
     else:
         assert grid is not None
         write_xdmf(out, grid, steps, of)
-    _say(f"wrote {out}: {len(steps)} times, for ParaView")
+    say(f"wrote {out}: {len(steps)} times, for ParaView")
 
 
 def _export_compact(folder: RunFolder, out: Path, step_px: float, together: tuple[Path, ...]) -> None:
@@ -181,7 +181,7 @@ def _export_compact(folder: RunFolder, out: Path, step_px: float, together: tupl
         write_compact(out, folder.read_result(), steps)
     before, after = sum(each.result().stat().st_size for each in folders), out.stat().st_size
     of = f"{len(folders)} runs" if together else folder.result().name
-    _say(f"wrote {out}: {after / 1e6:.3g} MB, {before / after:.1f} times smaller than {of}")
+    say(f"wrote {out}: {after / 1e6:.3g} MB, {before / after:.1f} times smaller than {of}")
 
 
 def _moves(folder: RunFolder) -> bool:
@@ -202,7 +202,7 @@ def _export_motion(folder: RunFolder, out: Path) -> None:
     found = result.object
     assert isinstance(found, MovingSurfaces)
     write_moving_glb(out, found, instants_of(folder), result.contents)
-    _say(f"wrote {out}: {found.count} bodies in motion")
+    say(f"wrote {out}: {found.count} bodies in motion")
 
 
 def _export_splats(result: Reconstruction, out: Path) -> None:
@@ -213,12 +213,12 @@ def _export_splats(result: Reconstruction, out: Path) -> None:
     if not isinstance(found, GaussianCloud):
         raise InputError(f"--splats needs a run of Gaussians, but this one holds {found.described}; use --bodies.")
     write_splats(out, found)
-    _say(f"wrote {out}: {found.described}, whose opacity stands for thickness")
+    say(f"wrote {out}: {found.described}, whose opacity stands for thickness")
 
 
 def _export_bodies(one: Moment, out: Path) -> None:
     from ..io.solids import write_glb, write_stl
-    from ..io.vtu import write_vtu
+    from ..io.vti import write_vtu
     from .surface import write_bodies
 
     found = one.result.object
@@ -235,7 +235,7 @@ def _export_bodies(one: Moment, out: Path) -> None:
         write_vtu(out, one.bodies, matter, of)
     else:
         write_bodies(out, one.bodies, of.of_matter(matter), {})
-    _say(f"wrote {out}: {len(one.bodies)} bodies")
+    say(f"wrote {out}: {len(one.bodies)} bodies")
 
 
 def _export_volume(
@@ -264,7 +264,7 @@ def _export_volume(
     slabs = ((f"an HDF5 file{how}", of_export(shape, ".h5")) for how, shape in _smaller(grid.shape))
     tell("the volume", of_export(grid.shape, volume.suffix.lower()), volume, slabs)
     write_volume_file(volume, result.object, grid, of=result.contents)
-    _say(f"wrote {volume}: {' × '.join(map(str, grid.shape))} voxels of {1e6 * grid.voxel_size[0]:.4g} µm")
+    say(f"wrote {volume}: {' × '.join(map(str, grid.shape))} voxels of {1e6 * grid.voxel_size[0]:.4g} µm")
     return grid
 
 
@@ -275,7 +275,3 @@ def _smaller(shape: tuple[int, int, int]) -> Iterator[tuple[str, tuple[int, int,
         z, y, x = (max(1, n // 2) for n in shape)
         shape = z, y, x
         yield f" with --shape {z} {y} {x} of larger voxels", shape
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 
 from ..beamline.grow import Growth, SeriesFolder
@@ -15,6 +14,7 @@ from ..units import in_percent
 from .places import Output
 from .progress import INTERRUPTED, ProgressBar
 from .room import tell
+from .sentence import say
 
 
 def grow(out: Output, what: Growth, resume: bool = False) -> None:
@@ -32,9 +32,9 @@ def grow(out: Output, what: Growth, resume: bool = False) -> None:
             grown = run(what, out, resume, lambda fraction: bar.show("cells in flow", fraction, {}))
     except KeyboardInterrupt:
         begun = SeriesFolder(out).state.is_file()
-        _say(f"interrupted; {'snapshots so far stay in' if begun else 'no snapshot yet in'} {out}; go on with --resume")
+        say(f"interrupted; {'snapshots so far stay in' if begun else 'no snapshot yet in'} {out}; go on with --resume")
         raise SystemExit(INTERRUPTED) from None
-    _say(
+    say(
         f"wrote {SeriesFolder(out).collection}: {grown.snapshots} snapshots of {what.cells} cells, "
         f"{what.period:.4g} s apart; {grown.state.taken} steps, {grown.state.refused} refused; "
         f"volume within {in_percent(grown.volume)}, area within {in_percent(grown.area)}"
@@ -43,7 +43,3 @@ def grow(out: Output, what: Growth, resume: bool = False) -> None:
 
 def _needs(what: Growth) -> Needs:
     return of_growth(what.cells, nodes_of(what.frequency), what.snapshots, what.flow * what.period)
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr)

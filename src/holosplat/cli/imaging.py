@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +19,7 @@ from ..workflows.correct import correct as correct_file
 from ..workflows.join import join as join_files
 from .places import Output
 from .progress import ProgressBar
+from .sentence import say
 
 OFF = 0.02
 """How far air may be off 1 before it is warned of."""
@@ -49,16 +49,14 @@ def record(
             on_progress=lambda fraction: bar.show("recording frames", fraction, {}),
             part=part,
         )
-    _say(
+    say(
         f"wrote {out}: {done.projections} projections, {done.flats} flats and {done.darks} darks, {camera.bits} bits, "
         f"{done.gain:.4g} counts a photon, {done.defects} defective pixels"
     )
     if done.saturated > 0:
-        _say(
-            f"warning: {done.saturated:.2%} of the projections' good pixels are saturated; lower --gain or the photons"
-        )
+        say(f"warning: {done.saturated:.2%} of the projections' good pixels are saturated; lower --gain or the photons")
     if truth is not None:
-        _say(f"wrote {truth}: what the frames do not say")
+        say(f"wrote {truth}: what the frames do not say")
 
 
 def correct(raw: Positional[Path], out: Output, how: CorrectionOptions, reading: Reading = Reading()) -> None:
@@ -71,15 +69,15 @@ def correct(raw: Positional[Path], out: Output, how: CorrectionOptions, reading:
     with ProgressBar() as bar:
         done = correct_file(raw, out, how, lambda fraction: bar.show("correcting frames", fraction, {}), reading)
     flat = f"flat fields of {done.components} components" if done.method == "dynamic" else "the mean flat field"
-    _say(f"wrote {out}: {done.frames} frames by {flat}, normalised: {done.normalised}")
-    _say(_levels(done, how.normalise is not None or bool(how.air)))
+    say(f"wrote {out}: {done.frames} frames by {flat}, normalised: {done.normalised}")
+    say(_levels(done, how.normalise is not None or bool(how.air)))
     if how.method is None and done.method == "plain":
-        _say(f"method plain, for the dynamic one needs three flats, and the file has {done.flats}")
+        say(f"method plain, for the dynamic one needs three flats, and the file has {done.flats}")
     if done.rings:
-        _say(f"rings: a pattern of {done.rings:.2%} (rms) that all frames had in common was divided out")
+        say(f"rings: a pattern of {done.rings:.2%} (rms) that all frames had in common was divided out")
     if done.airless:
-        _say(f"{done.airless} of the frames show no air; they were divided by the mean light of the others")
-    _say(f"filled defective pixels from their neighbours: {done.marked} marked in the file, {done.found} found beside")
+        say(f"{done.airless} of the frames show no air; they were divided by the mean light of the others")
+    say(f"filled defective pixels from their neighbours: {done.marked} marked in the file, {done.found} found beside")
 
 
 def _levels(done: Corrected, is_asked: bool) -> str:
@@ -123,8 +121,4 @@ def join(
             scans, out, pixel_size, flip, lambda fraction: bar.show("joining frames", fraction, {}), part, exposures
         )
     rows, columns = joined.views.shape
-    _say(f"wrote {out}: {len(joined)} frames of {rows} × {columns} pixels of {span(1e6 * joined.views.pixel_sizes)} µm")
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr)
+    say(f"wrote {out}: {len(joined)} frames of {rows} × {columns} pixels of {span(1e6 * joined.views.pixel_sizes)} µm")

@@ -43,8 +43,7 @@ def watched(flags: LiveFlags, title: str, on_progress: FitProgress) -> Iterator[
     if not flags.view:
         yield Follow(on_progress)
         return
-    from ..show.server import LiveView
-    from ..show.watch import Watch
+    from ..show.server import LiveView, Watch
 
     page = LiveView(title, flags.port)
     try:

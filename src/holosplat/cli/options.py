@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import UseAppendAction, arg
 
 from ..beamline.light import UnevenLight
-from ..beamline.poses import Directions, Geometry
+from ..beamline.misalignment import Directions, Geometry
 from ..checks import InputError, require
 from ..io.reading import ends_of
 from ..ranges import (
@@ -35,9 +35,8 @@ if TYPE_CHECKING:
     import numpy as np
 
     from ..beamline.misalignment import Misalignment
-    from ..beamline.scenes import Filling
     from ..beamline.series import SeriesFiles, Timing
-    from ..beamline.simulate import Shutter, Simulation
+    from ..beamline.simulate import Filling, Shutter, Simulation
     from ..matter import MaterialPrior, MatterKind
     from ..methods import Method
     from ..scan import Exposures
@@ -89,7 +88,7 @@ class MaterialOptions:
 
     def filling(self) -> Filling:
         """The materials that the options name."""
-        from ..beamline.scenes import Filling
+        from ..beamline.simulate import Filling
         from ..materials import parse_material, read_material_table
 
         require(self.medium is not None or self.medium_density is None, "--medium-density needs --medium.")

@@ -16,7 +16,7 @@ import tyro
 from tyro.conf import Positional, arg
 
 from ..checks import InputError, require
-from ..io.folder import is_taken
+from ..io.atomic import is_taken
 from ..io.lock import writer_of
 from ..io.provenance import is_hdf5
 from ..ranges import checked_later, with_checked_numbers
@@ -25,6 +25,7 @@ from .entry import command
 from .help import CONFIG, Option, is_essential, options_of, parser_of, wrap
 from .places import Place, is_run, of_times, places_of, require_apart
 from .resume import OF_ONE_CALL, is_made_by
+from .sentence import say
 
 STAGES = ("correct", "align", "reconstruct", "export")
 """Commands that a pipeline file may have as tables, in the order in which they run."""
@@ -99,7 +100,7 @@ class Stage:
         """Do what is left of it. Errors: `InputError` where that replaces what others made, without `redo`."""
         state, outs = self.state(), " and ".join(str(out.path) for out in self.outputs())
         if state == "done":
-            _say(f"[{self.name}] is done: {outs} is whole, and made by the same options from the same input")
+            say(f"[{self.name}] is done: {outs} is whole, and made by the same options from the same input")
             return
         require(
             state != "other" or redo,
@@ -109,7 +110,7 @@ class Stage:
         how = "resume" if state == "begun" and self._can_resume else "force"
         more = {how: True} if state != "new" else {}
         words = [*self.words, *(f"--{name}" for name in more)]
-        _say(f"[{self.name}] holosplat {' '.join(words)}")
+        say(f"[{self.name}] holosplat {' '.join(words)}")
         given = self.given.signature.bind(*self.given.args, **self.given.kwargs)
         given.arguments |= more
         with _typed(words):
@@ -300,7 +301,3 @@ def _typed(words: Sequence[str]) -> Iterator[None]:
         yield
     finally:
         sys.argv = before
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr)

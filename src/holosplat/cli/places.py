@@ -21,7 +21,7 @@ from typing import Annotated, Any, ParamSpec, TypeVar, get_args, get_origin
 from tyro.conf import Positional, arg
 
 from ..checks import InputError, require
-from ..io.folder import is_taken, require_new, require_parent
+from ..io.atomic import is_taken, require_new, require_parent
 from ..io.json import read_json
 from ..io.leftovers import LOCK
 from ..io.lock import require_unwritten

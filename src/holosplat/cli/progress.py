@@ -1,15 +1,25 @@
-"""What commands say while they work: notes on the input, progress, and the exit code of an interrupted one."""
+"""What commands say while they work: notes, progress, their log file; and the signals that end them."""
 
 from __future__ import annotations
 
 import logging
+import re
+import shlex
+import signal
 import sys
+import threading
 import time
-from collections.abc import Callable
-from types import TracebackType
-from typing import TYPE_CHECKING
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import TYPE_CHECKING, Any, TextIO
 
-from .log import log_of
+from ..checks import InputError, require
+from ..io.atomic import require_parent
+from ..version import __version__
+from .places import Place, require_apart
 
 if TYPE_CHECKING:
     from tqdm import tqdm
@@ -156,3 +166,123 @@ def _described(record: dict[str, float]) -> str:
     speed = record["step"] / record["seconds"] if record["seconds"] > 0 else 0.0
     size = f"{record['count']:.0f} Gaussians, " if "count" in record else ""
     return f"loss {record['loss']:.3e}, {size}{speed:.1f} steps/s"
+
+
+OWN = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d ")
+"""What each line of a log begins with."""
+COLOUR = re.compile(r"\x1b\[[0-9;]*m")
+REDRAWN = "\r"
+"""What progress on a terminal begins its lines with; a log has lines of its own for it."""
+
+
+class Log:
+    """A log in the making."""
+
+    def __init__(self, file: TextIO) -> None:
+        self._file = file
+
+    def say(self, line: str) -> None:
+        """A line with the time; nothing of an empty one."""
+        if line := COLOUR.sub("", line).rstrip():
+            print(time.strftime("%Y-%m-%d %H:%M:%S"), line, file=self._file, flush=True)
+
+
+class Copied:
+    """A stream of the terminal whose whole lines go to a log, too."""
+
+    def __init__(self, stream: TextIO, log: Log) -> None:
+        self._stream, self.log, self._begun = stream, log, ""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        """As of the stream."""
+        if REDRAWN not in text:
+            *lines, self._begun = (self._begun + text).split("\n")
+            for line in lines:
+                self.log.say(line)
+        return self._stream.write(text)
+
+
+def log_of(stream: Any) -> Log | None:
+    """The log to which the lines of a stream go, if there is one."""
+    return stream.log if isinstance(stream, Copied) else None
+
+
+@contextmanager
+def logged(arguments: Sequence[str]) -> Iterator[None]:
+    """Copy what the command with these `arguments` says to the file that --log names, behind what is there; nothing
+    without that option.
+
+    Errors: `InputError` for a file that is there and is no log.
+    """
+    path = _named(arguments)
+    if path is None:
+        yield
+        return
+    _require_log(path)
+    try:
+        file = path.open("a", encoding="utf-8", errors="backslashreplace")
+    except OSError as error:
+        raise InputError(f"--log must be a file to write, but {path} is not: {error}.") from None
+    with file:
+        log = Log(file)
+        log.say(f"$ {shlex.join(['holosplat', *arguments])} (version {__version__})")
+        out: Any = Copied(sys.stdout, log)
+        err: Any = Copied(sys.stderr, log)
+        try:
+            with redirect_stdout(out), redirect_stderr(err):
+                yield
+        except SystemExit as end:
+            log.say(f"ended with exit code {end.code or 0}")
+            raise
+        except BaseException:
+            for line in traceback.format_exc().splitlines():
+                log.say(line)
+            raise
+        log.say("ended with exit code 0")
+
+
+def _named(arguments: Sequence[str]) -> Path | None:
+    """The file behind --log; None where there is none."""
+    for word, after in zip(arguments, [*arguments[1:], ""]):
+        name, _, path = word.partition("=")
+        if name == "--log" and (path or after):
+            return Path(path or after)
+    return None
+
+
+def _require_log(path: Path) -> None:
+    """`InputError` unless `path` is a log, empty, or new in an existing folder."""
+    require_parent(path)
+    require_apart([Place("--log", path, written=True, kept=True)])
+    require(not path.is_dir(), f"--log must be a file, but {path} is a folder; add a file name.")
+    if not path.exists():
+        return
+    good = path.is_file() and path.stat().st_size == 0
+    if path.is_file() and not good:
+        with path.open(encoding="utf-8", errors="replace") as file:
+            good = OWN.match(file.read(80)) is not None
+    require(good, f"--log must be a new file, or a log to go on with, but {path} is another file; name a new one.")
+
+
+ASKING = (signal.SIGTERM, signal.SIGHUP)
+"""A cluster's warning before it kills, and a terminal that is gone."""
+
+
+def end_as_on_interrupt() -> None:
+    """From now on these signals do what Ctrl-C does, also where that is switched off, as in jobs of a shell's
+    background; those that are ignored, as under nohup, stay ignored. Only a main thread can say so."""
+    if threading.current_thread() is not threading.main_thread():
+        return
+    for number in ASKING:
+        if signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, _interrupt)
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    action = signal.getsignal(signal.SIGINT)
+    if not callable(action) or action is signal.SIG_IGN or action is signal.SIG_DFL:
+        raise KeyboardInterrupt
+    action(number, frame)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -20,6 +19,7 @@ from .light import LightFlags
 from .options import PriorOptions
 from .places import Output
 from .progress import ProgressBar
+from .sentence import say
 
 if TYPE_CHECKING:
     from ..baselines.retrieve import Retrieved
@@ -126,9 +126,5 @@ def _report(out: Path, measured: Scan, found: Retrieved, level: bool) -> None:
     low, high = (float(np.quantile(found.phase.numpy(), share)) for share in (1e-4, 1 - 1e-4))
     print(f"phase from {low:.4g} to {high + 0.0:.4g} rad (quantiles 1e-4 and 1 - 1e-4); light {found.light.in_words}")
     if not measured.exposures.distance.any():
-        _say("the frames are in contact: they show absorption, and the phase is what δ/β makes of it")
-    _say(f"wrote {out}: {what}, {len(measured)} frames")
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr)
+        say("the frames are in contact: they show absorption, and the phase is what δ/β makes of it")
+    say(f"wrote {out}: {what}, {len(measured)} frames")

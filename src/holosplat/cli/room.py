@@ -21,8 +21,7 @@ def tell_reconstruction(
     material frames nearly always say that it has levels. whole: whether it works on whole frames in any case."""
     from ..matter import Known
     from ..planning.needs import Sizes, of_reconstruction
-    from ..planning.seen import seen_of
-    from ..planning.smaller import smaller
+    from ..planning.scan_facts import seen_of, smaller
 
     exposures = scan.exposures[~scan.is_test]
     if len(exposures) == 0:
@@ -36,7 +35,7 @@ def tell_reconstruction(
 def tell_each_time(exposures: Exposures, out: Path, method: Method, matter: MatterKind | None) -> None:
     """The same where each time is reconstructed by itself."""
     from ..planning.acts import of_each_time, one_time, times_of
-    from ..planning.smaller import smaller
+    from ..planning.scan_facts import smaller
 
     if len(exposures) == 0:
         return
@@ -63,7 +62,7 @@ def tell(what: str, needs: Needs, out: Path, others: Iterable[tuple[str, Needs]]
 
 def tell_frames(what: str, exposures: Exposures, out: Path, of: Callable[[Exposures], Needs]) -> None:
     """The same of a job of which `of` says what it takes for such frames; larger pixels may fit."""
-    from ..planning.smaller import coarser
+    from ..planning.scan_facts import coarser
 
     if len(exposures):  # without any there is nothing to do, as the job will say
         tell(what, of(exposures), out, coarser(exposures, of))

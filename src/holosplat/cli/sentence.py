@@ -1,9 +1,14 @@
-"""The sentence with which a command ends that cannot do what it was asked for."""
+"""Sentences on standard error, and the one with which a command ends that cannot do its work."""
 
 from __future__ import annotations
 
 import sys
 from typing import NoReturn
+
+
+def say(text: str) -> None:
+    """Print `text` on standard error."""
+    print(text, file=sys.stderr)
 
 
 def give_up(sentence: str) -> NoReturn:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,17 +11,18 @@ from tyro.conf import Positional, arg, subcommand
 from ..checks import require
 from ..io.reading import Reading
 from ..ranges import Jobs, Positive, Seed, ranged
-from ..series.settings import Cut, Slurm
-from .bodies import BodyFlags, MotionFlags
+from ..series.plan import Cut, Slurm
 from .light import RunLightFlags
 from .options import MethodOptions, PriorOptions
 from .places import Output, with_checked_arguments
 from .progress import INTERRUPTED
+from .sentence import say
+from .track import BodyFlags, MotionFlags
 
 if TYPE_CHECKING:
     from ..series.folder import Row, SeriesFolder
+    from ..series.plan import Settings
     from ..series.run import Counts
-    from ..series.settings import Settings
 
 UNFINISHED = 4
 """Exit code of `series run` and `collect` where tasks failed or are left."""
@@ -54,7 +54,7 @@ class Act:
 
     def settings(self, track: bool, seed: int) -> Settings:
         """The settings of each task; `InputError` for options of the other act."""
-        from ..series.settings import Settings, Warm
+        from ..series.plan import Settings, Warm
 
         stray = _changed(self.motion, self.known) if not track else _changed(self.how)
         other = "goes with --track" if not track else "is of reconstruct; leave it, or --track"
@@ -91,11 +91,11 @@ class SlurmFlags(Slurm):
         from ..series.run import submit, write_script
 
         count, numbers = write_script(folder, self, retry)
-        _say(f"wrote {folder.script} for {count} task(s): {numbers}")
+        say(f"wrote {folder.script} for {count} task(s): {numbers}")
         if self.submit:
             print(submit(folder))
             return
-        _say(f"submit it by: sbatch {folder.script}")
+        say(f"submit it by: sbatch {folder.script}")
 
 
 NO_SLURM = SlurmFlags()
@@ -122,9 +122,9 @@ def plan(
         seed: Seed of everything random.
         track: Follow closed bodies through all times of a task, as holosplat track does; else each is reconstructed.
     """
-    from ..series.appearing import listed
     from ..series.folder import SeriesFolder
     from ..series.plan import plan_series
+    from ..series.watch import listed
 
     require(not matter.ranges(), "a series needs one number for --delta-beta; find it by reconstruct of one time.")
     settings = act.settings(track, seed)
@@ -132,7 +132,7 @@ def plan(
     found = plan_series(listed(scans), settings, matter.prior, reading, windows)
     folder.create(found)
     tasks, times = len(found.windows()), len(found.moments())
-    _say(f"{out}: {times} times of {len(found.sources)} scan(s) in {tasks} task(s); now: holosplat series run {out}")
+    say(f"{out}: {times} times of {len(found.sources)} scan(s) in {tasks} task(s); now: holosplat series run {out}")
 
 
 def run(
@@ -181,13 +181,13 @@ def run(
         elif dask is not None:
             from ..series.run import run_on_dask
 
-            counts = run_on_dask(series, dask, retry, lambda state: _say(f"task {state.number}: {state.state}"))
+            counts = run_on_dask(series, dask, retry, lambda state: say(f"task {state.number}: {state.state}"))
         elif jobs:
             counts = run_processes(series, jobs, retry)
         else:
             counts = run_left(series, retry, _tell_row)
     except KeyboardInterrupt:
-        _say(f"interrupted; what {folder} holds is whole, and the same command goes on from there")
+        say(f"interrupted; what {folder} holds is whole, and the same command goes on from there")
         raise SystemExit(INTERRUPTED) from None
     _end(series, counts)
 
@@ -195,13 +195,13 @@ def run(
 def _tell_row(row: Row) -> None:
     from ..series.folder import line_of
 
-    _say(line_of(row))
+    say(line_of(row))
 
 
 def _end(series: SeriesFolder, counts: Counts) -> None:
     """Say how far a series is; exit code 4 where something failed or is left."""
     said = f"{counts.done} done, {counts.running} running, {counts.failed} failed, {counts.left} left"
-    _say(f"{series.path}: {said}; holosplat series status|collect {series.path} say more")
+    say(f"{series.path}: {said}; holosplat series status|collect {series.path} say more")
     if counts.failed or counts.left:
         raise SystemExit(UNFINISHED)
 
@@ -234,9 +234,9 @@ def collect(folder: Positional[Path]) -> None:
 
     found = join(series := SeriesFolder(folder))
     for path in (series.table, series.bodies, series.page):
-        _say(f"wrote {path}")
+        say(f"wrote {path}")
     if found.missing:
-        _say(f"{len(found.missing)} of {len(found.moments)} times are missing: {some(found.missing)}")
+        say(f"{len(found.missing)} of {len(found.moments)} times are missing: {some(found.missing)}")
         raise SystemExit(UNFINISHED)
 
 
@@ -250,7 +250,3 @@ def series(
     ],
 ) -> None:
     """Reconstruct a series as tasks of their own: on this machine, by Slurm, on Dask (plan, run, status, collect)."""
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
@@ -25,6 +24,7 @@ from .options import (
 from .places import Output
 from .progress import ProgressBar
 from .room import tell_simulation
+from .sentence import say
 from .source import NO_SPECTRUM, SourceOptions
 from .specimen import SpecimenOptions
 from .truth import TruthOptions
@@ -32,8 +32,8 @@ from .truth import TruthOptions
 if TYPE_CHECKING:
     import numpy as np
 
-    from ..beamline.scenes import Filling
     from ..beamline.series import Timing
+    from ..beamline.simulate import Filling
     from ..geometry import Views
     from ..scan import Exposures
     from ..specimens.carried import CarriedScene
@@ -41,8 +41,7 @@ if TYPE_CHECKING:
     from ..specimens.drawn import Drawn
     from ..specimens.mesh_series import MeshSeries
     from ..specimens.rods import RodScene
-    from ..specimens.scene import MeshScene
-    from ..specimens.voxel_scene import VoxelScene
+    from ..specimens.scene import MeshScene, VoxelScene
     from ..volume import Object
 
     Still = MeshScene | ContinuousScene | VoxelScene | CarriedScene | RodScene
@@ -139,19 +138,19 @@ def simulate(
         targets.append((truth.true_exposures, true, facts | experiment.misalignment.facts()))
     tell_simulation(true_views, out, how.samples(true_views), len(true))
     if truth.write_mesh(specimen.matter):
-        _say(f"wrote {truth.truth_mesh}: the true surfaces")
+        say(f"wrote {truth.truth_mesh}: the true surfaces")
     with ProgressBar() as bar:
         _write_frames(targets, is_test, source.frames(specimen.matter, filled, true, how), bar)
     text = "{} frames of {} × {} pixels, {} of them held out".format(len(true), *beamline.detector, is_test.sum())
-    _say(f"wrote {out}: {text}{f', at {len(times)} times from {len(views)} views' if motion.frame_rate else ''}")
+    say(f"wrote {out}: {text}{f', at {len(times)} times from {len(views)} views' if motion.frame_rate else ''}")
     if truth.true_exposures:
-        _say(f"wrote {truth.true_exposures}: the same frames, with the exposures as they were")
+        say(f"wrote {truth.true_exposures}: the same frames, with the exposures as they were")
     for path, frame in volumes:
         _write_truth(path, specimen.matter.at(times[frame]), views.views)
-        _say(f"wrote {path}: the true volume{f' at {times[frame]:.6g} s' if motion.frame_rate else ''}")
+        say(f"wrote {path}: the true volume{f' at {times[frame]:.6g} s' if motion.frame_rate else ''}")
     for path, region in regions.items():
         _write_truth(path, region, views.views)
-        _say(f"wrote {path}: the share of each voxel that this part fills")
+        say(f"wrote {path}: the share of each voxel that this part fills")
 
 
 def _specimen(
@@ -165,9 +164,9 @@ def _specimen(
     """The bodies of `meshes`: moving, where there is a `timing`."""
     import numpy as np
 
-    from ..beamline.scenes import read_scene
     from ..beamline.series import read_series
-    from ..io.snapshots import COLLECTION, seeming_snapshots
+    from ..beamline.simulate import read_scene
+    from ..io.pvd import COLLECTION, seeming_snapshots
 
     if timing is None:
         files.require_static()
@@ -177,7 +176,7 @@ def _specimen(
         )
         matter = read_scene(meshes, filling, beamline.energy_kev, length_unit=files.length_unit, origin=files.origin)
         if (count := seeming_snapshots(meshes)) > 1:
-            _say(
+            say(
                 f"warning: the files seem to be {count} snapshots, but they are taken for one still scene, with "
                 "all bodies at once; for a series give --frame-rate."
             )
@@ -225,9 +224,9 @@ def _require_few(frames: int) -> None:
 def _say_of_missing_field(specimen: _Specimen, views: Views, pixel_size: float) -> None:
     missing = specimen.matter.missing_field(views)
     if specimen.goes_on:
-        _say("the matter, or its medium, goes on beyond the field of view; the frames are made with it")
+        say("the matter, or its medium, goes on beyond the field of view; the frames are made with it")
     elif missing > 0:
-        _say(
+        say(
             f"warning: the scene reaches {1e6 * missing:.3g} µm ({missing / pixel_size:.3g} pixels) beyond "
             "the detector in at least one view; enlarge --detector, or move --origin."
         )
@@ -256,7 +255,3 @@ def _write_truth(path: Path, matter: Object, views: Views) -> None:
 
     with ProgressBar() as bar:
         write_volume_file(path, matter, Grid.of_views(views), partial(bar.show, "voxels", record={}))
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr)

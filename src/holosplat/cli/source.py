@@ -14,16 +14,14 @@ from .options import BeamlineOptions
 if TYPE_CHECKING:
     import numpy as np
 
-    from ..beamline.scenes import Filling
-    from ..beamline.simulate import Simulation
+    from ..beamline.simulate import Filling, Simulation
     from ..optics.coherence import Spectrum
     from ..scan import Exposures
     from ..specimens.carried import CarriedScene
     from ..specimens.continuous import ContinuousScene
     from ..specimens.mesh_series import MeshSeries
     from ..specimens.rods import RodScene
-    from ..specimens.scene import MeshScene
-    from ..specimens.voxel_scene import VoxelScene
+    from ..specimens.scene import MeshScene, VoxelScene
 
     Still = MeshScene | ContinuousScene | VoxelScene | CarriedScene | RodScene
 

@@ -16,12 +16,12 @@ from .options import BeamlineOptions, MaterialOptions, MeshOptions, MotionOption
 if TYPE_CHECKING:
     import numpy as np
 
-    from ..beamline.scenes import Filling
+    from ..beamline.simulate import Filling
     from ..specimens.carried import CarriedScene
     from ..specimens.continuous import ContinuousScene
     from ..specimens.drawn import Drawn
     from ..specimens.matter import FieldMatter
-    from ..specimens.voxel_scene import VoxelScene
+    from ..specimens.scene import VoxelScene
 
 Moving = Literal["stirred-blob", "collapsing-foam"]
 Soft = Literal["soft-cells", "round-cell", "tissue", "head-phantom", "coated-droplets", "body-with-absorber"]
@@ -61,9 +61,9 @@ class VolumeOptions:
 
     def volume(self, paths: tuple[Path, ...], filling: Filling, energy_kev: float) -> VoxelScene:
         """The scene that the volume files `paths` describe."""
-        from ..io.volume_files import StackMeaning, read_specimen
+        from ..io.volume_formats import StackMeaning, read_specimen
         from ..matter import DeltaBeta
-        from ..specimens.voxel_scene import VoxelScene
+        from ..specimens.scene import VoxelScene
 
         known = self.value_delta is not None
         require(known or self.value_delta_beta is None, "--value-delta-beta needs --value-delta.")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -12,7 +11,7 @@ from typing import Any
 from tyro.conf import Positional
 
 from ..checks import require
-from ..io.folder import atomic_folder
+from ..io.atomic import atomic_folder
 from ..io.json import write_json
 from ..io.reading import Reading
 from ..io.volume_formats import read_volume_file
@@ -32,6 +31,7 @@ from .places import Output
 from .progress import ProgressBar
 from .room import tell_frames
 from .scans import run_and_scan
+from .sentence import say
 
 LENGTH_UNIT = "um"
 
@@ -64,10 +64,10 @@ def surface(
     (result, measured), volume = run_and_scan(folder, scan, reading), read_volume_file(truth) if truth else None
     name = "Gaussians" if result.object.kind == "gaussians" else "run"
     if not times and not folder.is_of(scan_hash(measured)):
-        _say("this is not the scan that was reconstructed: its held-out frames may have been fitted")
+        say("this is not the scan that was reconstructed: its held-out frames may have been fitted")
     if folder.read_config().get("prior", {}).get("kind") == "free":
         known = "δ and β" if result.delta_told else "β"
-        _say(f"nothing was known of the matter: {known} of the surfaces are what the run estimated")
+        say(f"nothing was known of the matter: {known} of the surfaces are what the run estimated")
     train = measured.exposures[~measured.is_test]
     tell_frames("surface", train, out, lambda seen: of_surfaces(seen, how))
     before = score(result, measured, volume)
@@ -82,7 +82,7 @@ def surface(
     write_bodies(out, bodies, result.contents.of_matter(found.matter), said)
     for of, scores in ((name, before), ("surfaces", after)):
         print(f"{of}:", *scores.lines(), sep="\n  ")
-    _say(f"wrote {out}: {len(bodies)} bodies of {len(found.faces)} triangles, {seconds:.1f} s")
+    say(f"wrote {out}: {len(bodies)} bodies of {len(found.faces)} triangles, {seconds:.1f} s")
 
 
 def write_bodies(
@@ -99,7 +99,3 @@ def write_bodies(
             "material": dict(constants),
         }
         write_json(temporary / "summary.json", {**about, **said})
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr)

@@ -33,8 +33,8 @@ def train(
     from ..report.curves import training_curves
     from ..training.aligned import AlignedTraining, AlignedValidation
     from ..training.folder import Dataset
+    from ..training.shown import Validation
     from ..training.train import Training, made_by
-    from ..training.validate import Validation
 
     scenes = Dataset.read(data)
     scenes.require_whole()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import asdict
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from .light import RunLightFlags
 from .options import MethodOptions, PriorOptions
 from .places import Kept
 from .progress import INTERRUPTED
+from .sentence import say
 from .series import Act, EachTime
 
 HOW, EACH, LIGHT = Watching(), EachTime(), RunLightFlags()
@@ -55,14 +55,10 @@ def watch(
         "reading": reading.as_table(),
     }
     result = WatchFolder(out)
-    _say(f"watching {folder}; the page is {result.page}; Ctrl-C ends")
+    say(f"watching {folder}; the page is {result.page}; Ctrl-C ends")
     try:
-        count = Watch(folder, result, settings, matter.prior, reading, how, _say).run(said)
+        count = Watch(folder, result, settings, matter.prior, reading, how, say).run(said)
     except KeyboardInterrupt:
-        _say(f"ended; what {out} holds is whole, and the same command goes on from there")
+        say(f"ended; what {out} holds is whole, and the same command goes on from there")
         raise SystemExit(INTERRUPTED) from None
-    _say(f"ended after {count} scan(s)")
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr)
+    say(f"ended after {count} scan(s)")

@@ -18,7 +18,6 @@ import numpy as np
 from ..checks import require
 from .guard import read_archive
 from .hdf5 import Fields, open_hdf5
-from .loader import Loader
 from .raw_file import (
     DARK,
     FLAT,
@@ -26,6 +25,7 @@ from .raw_file import (
     PROJECTION,
     RANGES,
     RAW_TAKES,
+    Loader,
     ScanFile,
     Stack,
     exposures_of,

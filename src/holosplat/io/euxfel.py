@@ -23,8 +23,7 @@ from ..preprocess.flat_field import mean_frame, relative_intensity
 from ..preprocess.pixels import filled, lit
 from ..scan import Exposures, Scan
 from .hdf5 import open_hdf5
-from .loader import Loader
-from .raw_file import DARK, FLAT, NOTHING, PROJECTION, TAKES, ScanFile, exposures_of, together
+from .raw_file import DARK, FLAT, NOTHING, PROJECTION, TAKES, Loader, ScanFile, exposures_of, together
 from .reading import marked
 
 FILES = re.compile(r"(RAW|CORR|PROC)-R\d+-\w+-S\d+\.h5$")

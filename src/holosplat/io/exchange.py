@@ -17,8 +17,7 @@ import numpy as np
 
 from ..units import ANGLE_UNITS, ENERGY_UNITS, LENGTH_UNITS
 from .hdf5 import Fields, open_hdf5
-from .loader import Loader
-from .raw_file import DARK, FLAT, NOTHING, PROJECTION, RAW_TAKES, ScanFile, exposures_of, together
+from .raw_file import DARK, FLAT, NOTHING, PROJECTION, RAW_TAKES, Loader, ScanFile, exposures_of, together
 from .stored_frames import reader
 
 DATA, WHITE, BLACK, THETA = (f"exchange/{name}" for name in ("data", "data_white", "data_dark", "theta"))

@@ -12,11 +12,9 @@ from ..checks import InputError, require
 from ..frames import Frames
 from ..scan import Scan
 from . import arrays, euxfel, exchange, images, nerf_synthetic, nxtomo, r2_gaussian, run_scan, tiff
-from .kept_frames import with_fields
-from .loader import Loader
-from .raw_file import ScanFile
+from .raw_file import Loader, ScanFile
 from .reading import Reading
-from .stored_frames import Mended
+from .stored_frames import Mended, with_fields
 
 ScanFormat = Literal["nxtomo", "nerf-synthetic", "tiff", "r2-gaussian"]
 """Formats that scans are written in."""

@@ -16,8 +16,7 @@ from h5py import h5d  # pyright: ignore[reportAttributeAccessIssue]  # compiled,
 from ..checks import InputError, MissingError, UnsaidError, is_of_memory, require_regular, shaped
 from ..units import unit_factor
 from .guard import require_memory
-from .hdf5_filters import filters_missing_in
-from .hdf5_guard import WRITING, opened_for_reading, require_own
+from .hdf5_guard import WRITING, filters_missing_in, opened_for_reading, require_own
 from .seal import require_sealed
 
 

@@ -7,18 +7,21 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import time
+import zlib
 from collections.abc import Iterator
+from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import h5py
-from h5py import h5d, h5l, h5o  # pyright: ignore[reportAttributeAccessIssue]  # compiled, without stubs
+from h5py import h5d, h5l, h5o, h5p, h5z  # pyright: ignore[reportAttributeAccessIssue]  # compiled, without stubs
 
-from ..checks import InputError, require, warn
-from .guard import DEEPEST, require_declared
-from .hdf5_chunks import require_chunks
-from .hdf5_filters import unknown_filters
-from .hdf5_sources import linked, require_external, virtual_sources
+from ..checks import InputError, require, require_regular, warn
+from .guard import DEEPEST, SMALL, require_declared
+from .room import free_memory
 from .seal import require_sealed
 
 MOST = 200_000
@@ -152,3 +155,162 @@ def _links(file: h5py.File, path: Path) -> Iterator[tuple[bytes, int]]:
     if len(found) > MOST:
         raise InputError(f"{path} must hold at most {MOST} entries, but it holds more.")
     return iter(found)
+
+
+DEFLATION = 1032
+"""How many times more bytes deflate can give than it takes (Deutsch 1996, RFC 1951: 258 bytes for two bits)."""
+SHARE = 4
+"""A chunk that cannot unpack to more than a quarter of the free memory is left to HDF5, which is as fast as reading."""
+PIECE = 1 << 20
+"""Bytes that are unpacked at a time."""
+
+
+def require_chunks(dataset: h5d.DatasetID, label: str, size: int) -> None:
+    """`InputError` if a chunk of `dataset`, in a file of `size` bytes, declares more than it can hold, or unpacks to
+    more than it declares."""
+    plan = dataset.get_create_plist()
+    if plan.get_layout() != h5d.CHUNKED:
+        return
+    declared = dataset.get_type().get_size()
+    for length in plan.get_chunk():
+        declared *= length
+    require_declared(f"a chunk of {label}", declared, size)
+    filters = [plan.get_filter(number)[0] for number in range(plan.get_nfilters())]
+    if h5z.FILTER_DEFLATE not in filters:
+        return
+    require(filters.count(h5z.FILTER_DEFLATE) == 1, f"{label} must be deflated once, but it is more often; unpack it.")
+    most = max(SMALL, free_memory() // SHARE)
+    if DEFLATION * size <= most:
+        return
+    place = filters.index(h5z.FILTER_DEFLATE)
+    for offset, skipped, stored in chunks_of(dataset):
+        if DEFLATION * stored > most and not skipped & (1 << place):
+            known = all(one == h5z.FILTER_FLETCHER32 for one in filters[place + 1 :])
+            require(known, f"{label} must be deflated last of all filters, but it is not; unpack it.")
+            _require_unpacked(dataset, offset, declared, label)
+
+
+def chunks_of(dataset: h5d.DatasetID) -> Iterator[tuple[tuple[int, ...], int, int]]:
+    """Offset, filters that were left out (a bit each) and stored bytes of each chunk."""
+    if not hasattr(dataset, "chunk_iter"):  # HDF5 before 1.14
+        infos = (dataset.get_chunk_info(number) for number in range(dataset.get_num_chunks()))
+        yield from ((info.chunk_offset, info.filter_mask, info.size) for info in infos)
+        return
+    found: list[tuple[tuple[int, ...], int, int]] = []
+
+    def take(info: h5d.StoreInfo) -> None:
+        found.append((info.chunk_offset, info.filter_mask, info.size))
+
+    dataset.chunk_iter(take)
+    yield from found
+
+
+def _require_unpacked(dataset: h5d.DatasetID, offset: tuple[int, ...], declared: int, label: str) -> None:
+    """`InputError` if a deflated chunk unpacks to more than `declared` bytes; it is unpacked in pieces."""
+    _, packed = dataset.read_direct_chunk(offset)
+    stream, size = zlib.decompressobj(), 0
+    try:
+        while packed and not stream.eof:
+            size += len(stream.decompress(packed, PIECE))
+            packed = stream.unconsumed_tail
+            if size > declared:
+                raise InputError(
+                    f"{label} unpacks to more than the {declared} bytes of its chunk; it is damaged, or no honest file."
+                )
+    except zlib.error as error:
+        raise InputError(f"{label} must be deflated, but it is damaged: {error}.") from None
+
+
+PLUGINS = "hdf5plugin"
+
+
+def unknown_filters(plan: h5p.PropDCID) -> dict[int, str]:
+    """Number and name of the filters of a dataset that HDF5 cannot undo, even with the plugins, if they are there."""
+    filters = [plan.get_filter(number) for number in range(plan.get_nfilters())]
+    unknown = {code: name.decode(errors="replace") for code, _, _, name in filters if not h5z.filter_avail(code)}
+    if unknown:
+        with suppress(ImportError):
+            import_module(PLUGINS)  # which registers its filters
+    return {code: name for code, name in unknown.items() if not h5z.filter_avail(code)}
+
+
+def filters_missing_in(path: Path) -> str:
+    """The filters in a file that HDF5 cannot undo, in words; empty if there are none, or it cannot be opened."""
+    found: dict[int, str] = {}
+
+    def look(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset):
+            found.update(unknown_filters(item.id.get_create_plist()))
+
+    with suppress(OSError, RuntimeError), h5py.File(path, "r") as file:
+        file.visititems(look)
+    return ", ".join(f"{name.split(';')[0] or 'unnamed'} (number {code})" for code, name in found.items())
+
+
+LINKS, VIRTUAL, EXTERNAL = "HDF5_EXT_PREFIX", "HDF5_VDS_PREFIX", "HDF5_EXTFILE_PREFIX"
+"""Variables of the environment that name folders in which HDF5 looks first."""
+SERIES = re.compile(r"%\d*b")
+"""Within the name of a virtual dataset's source: the number of a block."""
+
+
+def linked(path: Path, label: str, name: bytes) -> list[Path]:
+    """The files that a link of the file `path` to a file `name` may lead to; `InputError` where there is none, or it is
+    no regular file."""
+    return _required(path, label, [os.fsdecode(name)], LINKS)
+
+
+def virtual_sources(path: Path, label: str, plan: h5p.PropDCID, declared: int) -> list[Path]:
+    """The files of which a virtual dataset of `declared` bytes is put together, apart from `path` itself."""
+    names = dict.fromkeys(plan.get_virtual_filename(number) for number in range(plan.get_virtual_count()))
+    found = _required(path, label, [name for name in names if name != "."], VIRTUAL)
+    held = sum(place.stat().st_size for place in found) + path.stat().st_size
+    require_declared(label, declared, held)
+    return found
+
+
+def virtual_places(path: Path, name: str) -> list[Path]:
+    """The files that HDF5 may open for the source `name` of a virtual dataset of the file `path`."""
+    return [place for place in _places(path, name, VIRTUAL) if place.is_file()]
+
+
+def require_external(path: Path, label: str, plan: h5p.PropDCID, declared: int) -> None:
+    """`InputError` unless the files of a dataset with external storage are regular, and hold what it declares."""
+    parts = [plan.get_external(number) for number in range(plan.get_external_count())]
+    held = 0
+    for name, offset, size in parts:
+        (first, *_) = _required(path, label, [os.fsdecode(name)], EXTERNAL)
+        held += max(0, min(size, first.stat().st_size - offset))
+    require(
+        declared <= held,
+        f"{label} declares {declared:.3g} bytes of values, but the files beside it hold {held:.3g}; they are cut "
+        "short, or it is no honest file.",
+    )
+
+
+def _required(path: Path, label: str, names: list[str], prefix: str) -> list[Path]:
+    """All places of files that HDF5 may open for `names`, each a regular file; one at least for each name."""
+    found: list[Path] = []
+    for name in names:
+        places = [place for place in _places(path, name, prefix) if os.path.lexists(place)]
+        require(
+            bool(places) or SERIES.search(name) is not None,
+            f"{label} has its values in {name}, which is neither there nor beside it; bring both.",
+        )
+        for place in places:
+            require_regular(place, f"a file with the values of {label}")
+        found += places
+    return found
+
+
+def _places(path: Path, name: str, prefix: str) -> Iterator[Path]:
+    """Where HDF5 looks for the file `name` of `path`: as it is named, in folders of the environment, beside `path`, and
+    beside what `path` is a link to (`H5F_prefix_open_file`)."""
+    given, short = Path(name), Path(Path(name).name)
+    below = short if given.is_absolute() else given
+    folders = [Path(part) for part in os.environ.get(prefix, "").split(os.pathsep) if part]
+    for place in (given, *(folder / below for folder in (*folders, path.parent, path.resolve().parent))):
+        if SERIES.search(place.name):
+            like = re.compile(r"\d+".join(re.escape(part.replace("%%", "%")) for part in SERIES.split(place.name)))
+            yield from (one for one in sorted(place.parent.glob("*")) if like.fullmatch(one.name))
+        else:
+            yield place

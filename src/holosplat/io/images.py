@@ -20,10 +20,9 @@ from .angles import angles_of, read_angles, tell_angles
 from .file_order import in_order
 from .leftovers import is_hidden
 from .light_frames import light_frames
-from .loader import Loader
 from .nerf_synthetic import LOADER as NERF
 from .r2_gaussian import LOADER as R2
-from .raw_file import DARK, FLAT, NOTHING, PROJECTION, RAW_TAKES, ScanFile, exposures_of, together
+from .raw_file import DARK, FLAT, NOTHING, PROJECTION, RAW_TAKES, Loader, ScanFile, exposures_of, together
 from .stacks import IMAGES, ImageStack, images_in, stack_of
 from .stored_frames import reader
 from .tiff import LOADER as TIFF

@@ -1,4 +1,4 @@
-"""What a killed process leaves of files it was writing: named so that nobody reads it, and the next one removes it."""
+"""Names of half-written files, the removal of those that a killed process leaves, and files flushed to the disk."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import shutil
 import socket
 import zlib
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from pathlib import Path
 
 LOCK = ".lock"
@@ -105,3 +105,24 @@ def _kept(target: Path) -> str:
 
 def _escaped(name: str) -> str:
     return re.sub(r"([*?[])", r"[\1]", name)
+
+
+def flushed(path: Path) -> None:
+    """Wait until a file, or the names in a folder, are on the disk (fsync); `OSError` where the disk fails.
+
+    Some network file systems refuse this for folders, which is no failure.
+    """
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        with suppress(OSError) if path.is_dir() else nullcontext():
+            os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def flushed_tree(folder: Path) -> None:
+    """The same of all files and folders in `folder`."""
+    for path, _, files in os.walk(folder):
+        for name in files:
+            flushed(Path(path, name))
+        flushed(Path(path))

@@ -1,4 +1,4 @@
-"""The light of a run's training frames, as a file."""
+"""The light of a run's training frames as a file, and the light that a scan's frames were divided by."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from types import MappingProxyType
 import h5py
 import numpy as np
 
-from ..checks import InputError, finite
+from ..checks import InputError, finite, require
+from ..divided_light import DividedLight
 from ..optics.background import ORDER, Background
-from .hdf5 import open_hdf5
+from .hdf5 import Fields, open_hdf5
 from .hdf5_writing import new_hdf5, put
 
 FORMAT = "holosplat light 1"
@@ -46,3 +47,37 @@ def read_still_light(path: Path) -> np.ndarray | None:
         if not isinstance(found, h5py.Dataset) or found.ndim != 2:
             raise InputError(f"{path}: /still must be an image [H, W], but it is not; reconstruct anew.")
         return finite(f"{path}: /still", np.asarray(found[()], dtype=np.float32))
+
+
+GROUP = "process/light"
+LIGHT = f"entry/{GROUP}"
+"""In files of our own."""
+ARRAYS = ("covariances", "variances", "powers")
+PLACE = ("whole", "corner", "binning")
+
+
+def write_divided_light(group: h5py.Group, light: DividedLight) -> None:
+    """Its arrays, and as attributes where its frames lie in whole ones."""
+    put(group, "covariances", light.covariances.astype(np.float32))
+    put(group, "variances", light.variances)
+    put(group, "powers", light.powers)
+    group.attrs.update(whole=light.whole, corner=light.corner, binning=light.binning)
+
+
+def read_divided_light(fields: Fields, projections: np.ndarray) -> DividedLight | None:
+    """That of a file's `projections` [N] bool, or None where it says nothing. Errors: `InputError` for what does not
+    fit."""
+    group = fields.group.get(GROUP)
+    if not isinstance(group, h5py.Group):
+        return None
+    label = fields.label(GROUP)
+    try:
+        arrays = [np.asarray(group[name], dtype=np.float64) for name in ARRAYS]
+        whole, corner, binning = (np.asarray(group.attrs[name]).astype(int).ravel() for name in PLACE)
+        place = (int(whole[0]), int(whole[1])), (int(corner[0]), int(corner[1])), int(binning[0])
+        found = DividedLight(arrays[0], arrays[1], arrays[2], *place)
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise InputError(f"{label} must be what holosplat correct wrote, but it lacks or garbles {error}.") from error
+    count = int(projections.sum())
+    require(len(found) == count, f"{label} must be of {count} projections, but it is of {len(found)}.")
+    return found

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from ..checks import InputError
-from .folder import require_parent
+from .atomic import require_parent
 from .leftovers import LOCK, clear_all_leftovers, is_alive, namespace, temporary_name
 
 try:

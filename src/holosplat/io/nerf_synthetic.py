@@ -18,15 +18,13 @@ from ..checks import InputError, UnsaidError, at_least, in_range, require
 from ..geometry import Views
 from ..ranges import Metres, Positive, Signed, Small, ranged
 from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, Scan, checked_distance
-from .exposure_tables import beam_table, exposure_table, in_order, read_exposures
-from .folder import atomic_folder
+from .atomic import atomic_folder
 from .json import write_json
-from .loader import Loader, folder_with
-from .ply import write_ply
 from .png import LEVELS, PngKind, read_png, write_png
-from .raw_file import require_said, stand_in
+from .raw_file import Loader, folder_with, require_said, stand_in
 from .seeds import hull_points, uniform_points
-from .table import Table
+from .splats import write_ply
+from .table import Table, beam_table, exposure_table, in_order, read_exposures
 
 FORMAT = "holosplat NeRF-synthetic 1"
 TRAIN, TEST, VAL = (f"transforms_{split}.json" for split in ("train", "test", "val"))

@@ -17,10 +17,9 @@ from ..divided_light import DividedLight
 from ..scan import Exposures, Scan
 from ..version import __version__
 from . import arrays, exchange
-from .divided_light import LIGHT, write_divided_light
 from .hdf5_writing import new_hdf5, put, room_for
-from .loader import Loader
-from .raw_file import NOTHING, PROJECTION, RAW_TAKES
+from .light import LIGHT, write_divided_light
+from .raw_file import NOTHING, PROJECTION, RAW_TAKES, Loader
 from .scan_file import ANGLES, DATA, FLIPS, IMAGE_KEY, MASK, SPLIT, open_scan
 from .stored_frames import reader
 

@@ -13,13 +13,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..checks import InputError, as_written, finite, require
+from ..checks import InputError, as_written, finite, positive, require
+from ..matter import Matter
 from ..ranges import LARGEST, require_plausible
 from ..representations import KINDS, Stored
+from ..representations.gaussians import PARAMETERS, GaussianCloud
 from . import compact
-from .gaussians import FORMAT as GAUSSIANS
-from .gaussians import read_gaussians
-from .hdf5 import Fields, open_hdf5
+from .hdf5 import Fields, attribute_numbers, open_hdf5
 from .hdf5_writing import new_hdf5, put
 
 FORMAT = "holosplat object 1"
@@ -59,7 +59,7 @@ def read_object(path: Path) -> Stored:
             form != compact.SERIES,
             f"{path} must hold one object, but it holds a series of them; choose one with holosplat.io.series.",
         )
-        if form == GAUSSIANS:
+        if form == GAUSSIANS_FORMAT:
             return read_gaussians(path)
         kind = KINDS.get(str(file.attrs.get("kind", "")))
         if form not in (FORMAT, compact.FORMAT) or kind is None:
@@ -110,3 +110,28 @@ def joined(tensors: Mapping[str, Tensor], plain: Mapping[str, Any]) -> dict[str,
             place = place.setdefault(group, {})
         place[name] = tensor
     return state
+
+
+GAUSSIANS_FORMAT = "holosplat Gaussians 1"
+
+
+def read_gaussians(path: Path) -> GaussianCloud:
+    """The cloud that version 0.1 wrote; `InputError` if the file is damaged or no such file."""
+    with open_hdf5(path) as file:
+        fields = Fields(path, file)
+        arrays = {fields.label(name): fields.numbers(fields.need(name)) for name in PARAMETERS}
+        unit, delta, beta = (
+            float(attribute_numbers(f"{path}: @{name}", file.attrs.get(name), (1,))[0])
+            for name in ("unit_length", "delta", "beta")
+        )
+        other = file.attrs.get("second")
+        second = None if other is None else attribute_numbers(f"{path}: @second", other, (2,))
+    tensors = [torch.from_numpy(finite(label, array).astype(np.float32)) for label, array in arrays.items()]
+    if second is not None:
+        matter = Matter.several((delta, beta), (float(second[0]), float(second[1])))
+    else:
+        matter = Matter.one(delta, beta) if tensors[3].shape[1:] == (1,) else Matter.free(delta, beta)
+    try:
+        return GaussianCloud(tensors, positive("unit_length", unit, "metres"), matter)
+    except InputError as error:
+        raise InputError(f"{path} must hold Gaussians, but it does not: {error}") from error

@@ -13,7 +13,7 @@ from ..geometry import Grid
 from ..volume import Volume
 from .atomic import atomic_path
 from .hdf5_writing import require_room
-from .tiff_guard import all_images, image_numbers, open_tiff
+from .stacks import all_images, image_numbers, open_tiff
 from .volumes import ABSORPTION, REFRACTION, Contents, Stored, contents_of
 
 TIFF_SUFFIXES = (".tif", ".tiff")

@@ -18,7 +18,7 @@ from ..geometry import Grid
 from ..progress import Advance
 from ..units import LENGTH_UNITS, unit_factor
 from ..volume import Object, Volume
-from .folder import atomic_folder, require_new
+from .atomic import atomic_folder, require_new
 from .guard import require_memory
 from .hdf5_writing import require_room
 from .volumes import NAMES, REFRACTION, SLAB_VOXELS, Contents, Stored, contents_of, grid_of, slabs_of

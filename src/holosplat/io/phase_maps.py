@@ -10,10 +10,10 @@ import numpy as np
 
 from ..checks import require, shaped
 from ..scan import Exposures
-from .exposure_tables import exposure_table
-from .folder import atomic_folder
+from .atomic import atomic_folder
 from .hdf5_writing import new_hdf5, put
 from .json import write_json
+from .table import exposure_table
 
 FORMAT = "holosplat phase maps 1"
 HDF5 = (".h5", ".hdf5")

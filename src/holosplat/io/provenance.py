@@ -23,8 +23,7 @@ from typing import Any
 from ..checks import require
 from ..tables import read_table, table_in
 from ..version import __version__, source_commit
-from .durable import flushed
-from .leftovers import LOCK, clear_leftovers, files_in, is_begun, is_left, temporary_name
+from .leftovers import LOCK, clear_leftovers, files_in, flushed, is_begun, is_left, temporary_name
 from .leftovers import RECORD as NAME
 
 ATTRIBUTE = "provenance"

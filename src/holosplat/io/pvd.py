@@ -1,21 +1,29 @@
-"""Time series of mesh files: ParaView's collection (.pvd), an XML list of files with the time of each.
+"""Time series of mesh files: ParaView's collection (.pvd), and the snapshots that a folder or a list of files has.
 
 ParaView opens only VTK's XML files from a collection, such as .vtp and .vtu, and no legacy .vtk; `read_pvd` takes both.
+
+A body's files have the same name except for the number at the end: `rbc03_007.vtk` is body `rbc03`, snapshot 7.
 """
 
 from __future__ import annotations
 
 import math
 import os
+import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
-from ..checks import InputError, require, require_regular
+import numpy as np
+
+from ..checks import InputError, positive, require, require_regular
 from ..tables import number_in
+from ..units import TIME_UNITS, unit_factor
 from .atomic import atomic_path
+from .vtk import mesh_files
 
 
 @dataclass(frozen=True)
@@ -77,3 +85,139 @@ def _number(path: str | Path, entry: ElementTree.Element, name: str, default: st
         f"{path}: {name} of {entry.get('file')!r} must be a number, but it is {entry.get(name)!r}; write it anew.",
     )
     return number
+
+
+NUMBERED = re.compile(r"(?P<body>.*?)[_.\-]?(?P<number>\d+)")
+HEADER_TIME = re.compile(r"\bt(?:ime)?\s*=\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*([A-Za-zµ]+)")
+"""How a time stands in the second line of a legacy VTK file: `t=17.7us`."""
+COLLECTION = ".pvd"
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """The files of all bodies, in the order of their names, at `time` [s]."""
+
+    time: float
+    files: tuple[Path, ...]
+
+
+def find_snapshots(
+    paths: Sequence[Path], interval: float | None = None, time_unit: str | None = None
+) -> list[Snapshot]:
+    """Snapshots in the order of time, all of the same bodies.
+
+    paths: one collection (.pvd), or numbered mesh files and folders of them. The times are `interval` [s] apart, if it
+    is given; else the times in the headers of legacy VTK files (`t=17.7us`); else the time steps of the collection, in
+    `time_unit` (default: seconds). Errors: `InputError` for names without a number, bodies that are missing in some
+    snapshot, a damaged collection, and missing times.
+    """
+    collections = [path for path in paths if path.suffix.lower() == COLLECTION]
+    require(
+        not collections or len(paths) == 1, f"a collection ({COLLECTION}) must be given alone, without other meshes."
+    )
+    require(
+        time_unit is None or bool(collections), f"a time unit goes with a collection ({COLLECTION}), which has none."
+    )
+    if collections:
+        listed = {step.time: list(step.files) for step in read_pvd(collections[0])}
+        factor = unit_factor("time unit", time_unit or "s", TIME_UNITS)
+        said = {key: key * factor for key in listed}
+    else:
+        listed, said = _by_number(mesh_files(paths)), {}
+    keys = sorted(listed)
+    ordered = [_in_order(listed[key]) for key in keys]
+    for bodies in ordered[1:]:
+        _require_same_bodies(ordered[0], bodies)
+    if interval is not None:
+        step = positive("snapshot interval", interval, "seconds")
+        counts = np.arange(len(keys)) if collections else np.array(keys) - keys[0]
+        times = [float(step * count) for count in counts]
+    else:
+        times = [_time(list(bodies.values()), said.get(key)) for key, bodies in zip(keys, ordered)]
+    found = [Snapshot(time, tuple(bodies.values())) for time, bodies in zip(times, ordered)]
+    for before, after in pairwise(found):
+        require(
+            after.time > before.time,
+            f"snapshots must follow one another in time, but {after.files[0].name}, at {after.time:g} s, is not after "
+            f"{before.files[0].name}, at {before.time:g} s; correct the files, or give --snapshot-interval.",
+        )
+    return found
+
+
+def seeming_snapshots(paths: Sequence[Path]) -> int:
+    """How many snapshots mesh files seem to be of, by their names alone: two bodies or more, each with all the numbers.
+
+    1 where they do not.
+    """
+    numbers: dict[str, set[int]] = {}
+    for file in mesh_files(paths):
+        if (match := NUMBERED.fullmatch(file.stem)) is None:
+            return 1
+        numbers.setdefault(match["body"], set()).add(int(match["number"]))
+    first, *others = numbers.values()
+    return len(first) if others and all(other == first for other in others) else 1
+
+
+def _by_number(files: list[Path]) -> dict[float, list[Path]]:
+    found: dict[float, list[Path]] = {}
+    for file in files:
+        match = NUMBERED.fullmatch(file.stem)
+        if match is None:
+            raise InputError(
+                f"{file} must end with the number of its snapshot, such as cell00_007.vtk, to be part of a series."
+            )
+        found.setdefault(float(match["number"]), []).append(file)
+    return found
+
+
+def _in_order(files: list[Path]) -> dict[str, Path]:
+    """Files by body, in the order of the bodies' names."""
+    bodies: dict[str, Path] = {}
+    for file in files:
+        match = NUMBERED.fullmatch(file.stem)
+        body = match["body"] if match else file.stem
+        if body in bodies:
+            raise InputError(f"{file} and {bodies[body]} are the same body at the same time; keep one of them.")
+        bodies[body] = file
+    return dict(sorted(bodies.items()))
+
+
+def _require_same_bodies(first: dict[str, Path], other: dict[str, Path]) -> None:
+    if lost := sorted(first.keys() ^ other.keys()):
+        body = lost[0]
+        has, lacks = (first, other) if body in first else (other, first)
+        raise InputError(
+            f"every snapshot must hold the same bodies, but {has[body].name} has no match beside "
+            f"{next(iter(lacks.values())).name}; add it, or leave the snapshot out."
+        )
+
+
+def _time(files: list[Path], said: float | None) -> float:
+    """Time [s] of one snapshot, from its files' headers, or else from the collection."""
+    times = {_header_time(file) for file in files}
+    if len(times) > 1:
+        raise InputError(f"the files of one snapshot must be of one time, but {files[0].name} and others differ.")
+    (time,) = times
+    if time is None:
+        time = said
+    if time is None:
+        raise InputError(f"{files[0]} does not say its time (t=17.7us in the second line); give --snapshot-interval.")
+    return time
+
+
+def _header_time(file: Path) -> float | None:
+    require_regular(file, "a mesh file")
+    try:
+        with file.open("rb") as opened:
+            lines = opened.read(512).split(b"\n")
+    except OSError as error:
+        raise InputError(f"{file} must be a readable file, but reading it failed: {error}.") from None
+    if len(lines) < 2 or not lines[0].startswith(b"# vtk DataFile"):
+        return None
+    match = HEADER_TIME.search(lines[1].decode(errors="replace"))
+    if match is None:
+        return None
+    try:
+        return float(match[1]) * unit_factor(f"{file}: the time in its header", match[2], TIME_UNITS)
+    except ValueError as error:
+        raise error if isinstance(error, InputError) else InputError(f"{file}: {match[0]!r} is no time.") from None

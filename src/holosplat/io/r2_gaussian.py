@@ -21,14 +21,12 @@ from ..ranges import ranged
 from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, Scan
 from ..units import wavenumber
 from ..volume import Volume
-from .exposure_tables import beam_table, exposure_table, in_order, read_exposures
-from .folder import atomic_folder
+from .atomic import atomic_folder
 from .guard import read_array
 from .json import write_json
-from .loader import Loader, folder_with
-from .raw_file import stand_in
+from .raw_file import Loader, folder_with, stand_in
 from .seeds import hull_points
-from .table import Table
+from .table import Table, beam_table, exposure_table, in_order, read_exposures
 
 FORMAT = "holosplat R2-Gaussian 1"
 META = "meta_data.json"

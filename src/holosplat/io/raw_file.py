@@ -1,4 +1,4 @@
-"""Files of frames of all kinds (projections, flats, darks) that are open for reading, whatever their format."""
+"""Files of frames of all kinds (projections, flats, darks) that are open for reading, and the loaders of formats."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -16,6 +16,9 @@ from ..geometry import Views, rotation_y
 from ..preprocess.flat_field import mean_frame
 from ..scan import DISTANCE_RANGE_M, ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, checked_distance
 from .stacks import ImageStack
+
+if TYPE_CHECKING:
+    from ..scan import Scan
 
 PROJECTION, FLAT, DARK, INVALID = range(4)
 
@@ -225,3 +228,29 @@ def together(label: str, parts: Sequence[tuple[int, Stack | None]]) -> tuple[tup
         stacks.append(stack)
         kinds += [kind] * stack.shape[0]
     return tuple(stacks), np.array(kinds)
+
+
+@dataclass(frozen=True)
+class Loader:
+    """One format of scans, recognised by the content of a path.
+
+    name: of the format, for messages.
+    mark: description of a path of that format ("a folder with scan.json").
+    recognises: whether a path is one, by its content.
+    read: the scan at such a path, with the values that it lacks.
+    takes: names of these values (energy_kev [keV], distance [m], pixel_size [m], angles_deg [N], flats and darks,
+        paths of images; files, the names of images in a folder; entry, of an HDF5 file; black, white).
+    opens: opens such a file frame by frame, raw ones with their flats and darks; None where frames are corrected.
+    """
+
+    name: str
+    mark: str
+    recognises: Callable[[Path], bool]
+    read: Callable[[Path, Mapping[str, Any]], Scan]
+    takes: tuple[str, ...] = ()
+    opens: Opens | None = None
+
+
+def folder_with(*names: str) -> Callable[[Path], bool]:
+    """Whether a path is a folder that holds all the files `names`."""
+    return lambda path: path.is_dir() and all((path / name).is_file() for name in names)

@@ -1,14 +1,15 @@
-"""The scan that a run folder was made from: `source.json` there names it, and the time that was chosen."""
+"""The scan that a run folder was made from, as `source.json` names it, and the marks of a run's HDF5 files."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from ..checks import require
 from ..scan import Scan
-from .loader import Loader, folder_with
+from .hdf5 import open_hdf5
+from .raw_file import Loader, folder_with
 from .reading import Reading
 from .table import Table
 
@@ -72,3 +73,9 @@ def loader(read_as: ReadAs) -> Loader:
     """The loader of run folders, whose scans `read_as` opens."""
     mark = f"a run folder, with config.json and {SOURCE}"
     return Loader("run", mark, folder_with("config.json", SOURCE), lambda path, given: read_run_scan(path, read_as))
+
+
+def read_marks(path: Path, names: Sequence[str]) -> dict[str, str]:
+    """Those of the attributes `names` that the file has at its top. Errors: `InputError`."""
+    with open_hdf5(path) as file:
+        return {name: str(file.attrs[name]) for name in names if name in file.attrs}

@@ -10,8 +10,7 @@ from pathlib import Path
 
 from ..checks import InputError, require
 from ..tables import from_table, read_table
-from .atomic import atomic_path
-from .folder import atomic_folder
+from .atomic import atomic_folder, atomic_path
 
 SAMPLES = Path(__file__).with_name("samples.toml")
 CACHE = "HOLOSPLAT_DATA"

@@ -18,8 +18,8 @@ from ..checks import InputError, UnsaidError, finite, in_range, require, shaped,
 from ..geometry import Views, rotation_y
 from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, checked_distance
 from ..units import ANGLE_UNITS, ENERGY_UNITS, LENGTH_UNITS, TIME_UNITS
-from .divided_light import read_divided_light
 from .hdf5 import Fields, attribute_text, open_hdf5
+from .light import read_divided_light
 from .nxtomo_geometry import FLIPS as FLIPS
 from .nxtomo_geometry import SHIFT, about_axis, flips_of, magnification, tell_moves
 from .raw_file import (

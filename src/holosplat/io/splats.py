@@ -9,16 +9,17 @@ what is lost.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from ..checks import require
+from ..checks import finite, require, shaped
 from ..geometry import Views
 from ..representations import GaussianCloud
 from ..representations.gaussians import unit_quaternions
-from .ply import write_vertices
+from .atomic import atomic_path
 
 MICROMETRES = 1e6
 DEPTH = 3.0
@@ -88,3 +89,31 @@ def colours(cloud: GaussianCloud) -> np.ndarray:
     amplitudes = cloud.amplitudes.double().numpy()
     shares = amplitudes / np.maximum(amplitudes.sum(axis=1, keepdims=True), 1e-30)
     return shares @ COLOURS[np.arange(shares.shape[1]) % len(COLOURS)]
+
+
+POINT = np.dtype(
+    [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [(c, "u1") for c in ("red", "green", "blue")]
+)
+"""A point of the file: position, normal (which these programs ask for, and do not use), colour."""
+
+
+def write_ply(path: str | Path, points: np.ndarray, grey: int = 128) -> None:
+    """Write points [N, 3], in whatever unit, as binary little-endian PLY; all have the colour (grey, grey, grey)."""
+    shaped("points", finite("points", np.asarray(points, dtype=np.float64)), (None, 3))
+    rows = np.zeros(len(points), POINT)
+    for axis, name in enumerate("xyz"):
+        rows[name] = points[:, axis]
+    for name in ("red", "green", "blue"):
+        rows[name] = grey
+    write_vertices(path, rows)
+
+
+def write_vertices(path: str | Path, rows: np.ndarray, comments: Sequence[str] = ()) -> None:
+    """Write the vertices `rows` [N], whose fields are little-endian float32 or uint8, with lines of comment."""
+    kinds = {np.dtype("<f4"): "float", np.dtype("u1"): "uchar"}
+    header = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
+    header += [f"element vertex {len(rows)}"]
+    header += [f"property {kinds[rows.dtype[name]]} {name}" for name in rows.dtype.names or ()]
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        file.write("\n".join([*header, "end_header", ""]).encode("ascii"))
+        file.write(rows.tobytes())

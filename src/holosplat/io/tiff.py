@@ -10,12 +10,11 @@ import numpy as np
 
 from ..checks import finite, require
 from ..scan import Scan
-from .exposure_tables import beam_table, exposure_table, read_exposures
-from .folder import atomic_folder
+from .atomic import atomic_folder
 from .json import write_json
-from .loader import Loader
-from .table import Table
-from .tiff_guard import all_images
+from .raw_file import Loader
+from .stacks import all_images
+from .table import Table, beam_table, exposure_table, read_exposures
 
 FORMAT = "holosplat TIFF 1"
 SCAN = "scan.json"

@@ -1,6 +1,10 @@
 """Volumes as VTK image data (.vti), for ParaView, PyVista and VisIt: δ and β as point data, lengths in µm.
 
 Points are voxel centres. The values are appended to the XML as they are, so that writing takes no memory for them.
+
+All bodies of one time in one file of VTK's unstructured grids (.vtu): triangles in µm, with data of their bodies.
+Cell data: `body`, its number from 0 on; `delta` (`mu_per_m` where δ is not known), `beta` of its matter; `volume_m3`,
+what it encloses. Field data: `length_unit_m`, a number: some readers take no texts.
 """
 
 from __future__ import annotations
@@ -9,6 +13,7 @@ import math
 import os
 import re
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +21,8 @@ import numpy as np
 
 from ..checks import InputError, require, require_regular
 from ..geometry import Grid
+from ..matter import Matter
+from ..mesh import TriangleMesh
 from ..progress import Advance
 from ..units import LENGTH_UNITS, unit_factor
 from ..volume import Object
@@ -24,7 +31,7 @@ from .guard import require_declared, require_memory, xml_fault
 from .hdf5_writing import require_room
 from .plain_values import LENGTH_UNIT, fill, micrometres
 from .volumes import NAMES, REFRACTION, Contents, Stored, contents_of, grid_of
-from .vtk import quiet
+from .vtk import BODY, TRIANGLE, quiet, save
 from .vtk_guard import blocks_fault
 
 UNIT = "length_unit"
@@ -138,3 +145,34 @@ def _values(array: Any) -> np.ndarray:
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     return vtk_to_numpy(array)
+
+
+def write_vtu(path: Path, bodies: Sequence[TriangleMesh], matter: Matter, of: Contents = REFRACTION) -> None:
+    """Write `bodies`, all of `matter`; `read_meshes` takes them apart again."""
+    from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
+    from vtkmodules.vtkCommonCore import vtkPoints
+    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkUnstructuredGrid
+    from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
+
+    require(len(bodies) > 0, f"{path} needs at least one body.")
+    before = np.cumsum([0, *(len(body.vertices) for body in bodies)])
+    places = np.concatenate([body.vertices for body in bodies]) / LENGTH_UNITS[LENGTH_UNIT]
+    corners = np.concatenate([body.faces + start for body, start in zip(bodies, before)])
+    number = np.repeat(np.arange(len(bodies), dtype=np.int32), [len(body.faces) for body in bodies])
+    data = {name: np.full(len(corners), value) for name, value in of.of_matter(matter).items()}
+    data = {BODY: number, **data, "volume_m3": np.array([body.volume for body in bodies])[number]}
+
+    grid, points, cells = vtkUnstructuredGrid(), vtkPoints(), vtkCellArray()
+    points.SetData(numpy_to_vtk(np.ascontiguousarray(places), deep=True))
+    rows = np.insert(corners, 0, 3, axis=1)
+    cells.ImportLegacyFormat(numpy_to_vtkIdTypeArray(np.ascontiguousarray(rows.reshape(-1)), deep=True))
+    grid.SetPoints(points)
+    grid.SetCells(TRIANGLE, cells)
+    for name, values in data.items():
+        array = numpy_to_vtk(values, deep=True)
+        array.SetName(name)
+        grid.GetCellData().AddArray(array)
+    unit = numpy_to_vtk(np.array([LENGTH_UNITS[LENGTH_UNIT]]), deep=True)
+    unit.SetName("length_unit_m")
+    grid.GetFieldData().AddArray(unit)
+    save(path, vtkXMLUnstructuredGridWriter(), grid)

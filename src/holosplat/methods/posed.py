@@ -3,7 +3,7 @@
 Two views leave most of a volume open, but not the poses of bodies whose shape is known. So where a network that knows
 red cells guesses bodies that the frames do not contradict, cells are looked for by their shadows as `track --body` does
 (`bodies`), of a size that is the guess's, and begin with its bodies. Their surfaces are then fitted like any others,
-free of the shape at rest, and each cell is tried as its twin (`bodies.twin`), which two beams hardly tell from it.
+free of the shape at rest, and each cell is tried as its twin (`bodies.poses`), which two beams hardly tell from it.
 """
 
 from __future__ import annotations
@@ -14,11 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from ..bodies.cut import cut_bodies, is_cut
-from ..bodies.moments import moments, second_moments
-from ..bodies.rest_shape import KnownBody, extent_like, guessed_cells
+from ..bodies.poses import distance, twin_map, two_beams
+from ..bodies.rest_shape import KnownBody, cut_bodies, extent_like, guessed_cells, is_cut, moments, second_moments
 from ..bodies.search import BodySearch, sized
-from ..bodies.twin import distance, twin_map, two_beams
 from ..checks import InputError
 from ..learning.start import Guessed
 from ..matter import DeltaBeta, Matter

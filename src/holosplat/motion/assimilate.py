@@ -24,12 +24,11 @@ from ..model import Instrument, Model
 from ..ranges import ranged
 from ..representations import SurfaceMesh
 from ..scan import Scan
-from .cell_flow import CellFlow, Unknowns, advanced
 from .cell_model import CellModel, Range
+from .detections import beside, only
 from .dynamics import Window
 from .forecast import Forecast
-from .membrane_fit import Bound
-from .residual_detection import beside, only
+from .membrane_fit import Bound, CellFlow, Unknowns, advanced
 
 AFFINE = 12
 """Numbers of a cell's first state: how far it is moved, and its linear map."""

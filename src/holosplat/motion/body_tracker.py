@@ -21,16 +21,26 @@ from ..optics.background import Light
 from ..progress import FitProgress
 from ..representations import MovingSurfaces, TimeBasis
 from ..scan import Scan
-from .detections import Detection, SightingOptions, network_for, sightings
+from .detections import (
+    Detection,
+    SightingOptions,
+    apart,
+    beside,
+    joined,
+    network_for,
+    only,
+    sightings,
+    sure_ones,
+    whole_ones,
+    without_merger,
+)
 from .elastic import Rest
 from .fit import MotionFit, motion_fit
-from .journal import Journal, from_sightings, to_sightings
 from .known import KnownBodies, at_rest
+from .measures import astray, halves_of, tell_shapes
 from .pieces import chosen_paths
-from .residual_detection import apart, beside, joined, only, sure_ones, whole_ones, without_merger
-from .split_half_errors import astray, halves_of, tell_shapes
 from .track_linking import first_paths
-from .track_options import TrackOptions
+from .track_options import Journal, TrackOptions, from_sightings, to_sightings
 from .two_view_ambiguity import Trials, chosen_twins
 
 CHECKPOINT_SECONDS = 20.0

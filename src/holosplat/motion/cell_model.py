@@ -17,9 +17,8 @@ from ..specimens.flow.channel import Channel
 from ..specimens.flow.suspension import Medium
 from ..specimens.membrane.model import Elasticity, Membrane
 from ..specimens.membrane.resting import resting_cell
-from .cell_flow import CellFlow, Unknowns, Velocity, advanced
 from .forecast import areas, normals
-from .membrane_fit import Bound, dressed, scaled
+from .membrane_fit import Bound, CellFlow, Unknowns, Velocity, advanced, dressed, scaled
 
 ENDLESS = 1e-3
 """Length of the channel [m]: no field holds cells that feel each other around it."""

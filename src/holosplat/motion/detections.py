@@ -1,18 +1,20 @@
-"""Bodies at single times: a volume of each time, by tomography or by a network, cut into closed surfaces."""
+"""Bodies at single times: volumes cut into closed surfaces, and bodies that the frames show beside known ones."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from ..baselines import HolographicTV, holographic_tv
-from ..bodies.cut import EDGE, LEAST_VOLUME, LEVEL, SMOOTHING, cut_bodies, is_cut
-from ..bodies.moments import centroid
+from ..bodies.rest_shape import EDGE, LEAST_VOLUME, LEVEL, SMOOTHING, centroid, cut_bodies, is_cut
 from ..checks import in_range
-from ..geometry import Grid
+from ..fit.residuals import Prediction
+from ..geometry import Grid, Views
 from ..inference import Decision, Score, select
 from ..learning.network import Guess
 from ..learning.start import Guessed, LearnedStart, guess_matter, missing_thickness
@@ -20,7 +22,7 @@ from ..matter import DeltaBeta, Matter
 from ..mesh import TriangleMesh
 from ..progress import Progress
 from ..ranges import Pixels, Weight, ranged
-from ..representations import VoxelGrid
+from ..representations import MovingSurfaces, VoxelGrid
 from ..scan import Scan
 
 
@@ -122,3 +124,157 @@ def missed_by_bodies(values: Tensor, found: Guessed, level: float) -> Score:
     values: [Z, Y, X] on the voxels of `found`, of which what is above `level` is full
     """
     return Score.of(missing_thickness((values > level).to(torch.float32), found.images, found.taps)[0])
+
+
+CENTRES, PART, NEAR_PX = 0.6, 0.5, 2.0
+"""When a body is one of its own: radii between centres, share of the median volume, and distance [pixels]."""
+SURE = 0.75
+"""Share of the median volume from which on a body is believed before all others are known."""
+DARKEST = 0.05
+"""Relative intensity of a predicted pixel below which it divides no further."""
+
+
+def beside(train: Scan, bodies: MovingSurfaces, oversample: int) -> Scan:
+    """The frames over those that `bodies` give: nearly what the matter that is left would give by itself.
+
+    Phases of bodies add up in the exit wave, whose product with the waves of others is what is measured; behind the
+    sample that is right to first order in the phases, which a first guess of what is left can do with.
+    """
+    said = predicted(train, bodies, oversample)
+    return replace(train, frames=(train.frames / np.maximum(said, DARKEST)).astype(np.float32))
+
+
+def predicted(train: Scan, bodies: MovingSurfaces, oversample: int) -> np.ndarray:
+    """[N, H, W]: the frames that `bodies` give in the exposures of `train`."""
+    said = Prediction(bodies, train.exposures, oversample)
+    with torch.no_grad():
+        return np.stack([said.view(v).frames()[0].numpy() for v in range(len(train))])
+
+
+def joined(one: MovingSurfaces, other: MovingSurfaces) -> MovingSurfaces:
+    """All bodies of two sets, those of `one` first; of the same basis, unit and material."""
+    return MovingSurfaces(
+        torch.cat([one.coefficients.detach(), other.coefficients.detach()], dim=1),
+        torch.cat([one.faces, other.faces + one.coefficients.shape[1]]),
+        torch.cat([one.of_body, other.of_body + one.count]),
+        one.basis,
+        one.unit_length,
+        one.matter,
+        one.lines,
+    )
+
+
+def only(bodies: MovingSurfaces, numbers: Sequence[int]) -> MovingSurfaces:
+    """The bodies `numbers`, in that order; at least one."""
+    parts = [bodies.body(k) for k in numbers]
+    starts = np.cumsum([0, *(len(used) for used, _ in parts[:-1])])
+    return MovingSurfaces(
+        torch.cat([bodies.coefficients.detach()[:, used] for used, _ in parts], dim=1),
+        torch.cat([faces + int(start) for (_, faces), start in zip(parts, starts)]),
+        torch.cat([torch.full((len(faces),), k) for k, (_, faces) in enumerate(parts)]),
+        bodies.basis,
+        bodies.unit_length,
+        bodies.matter,
+        bodies.lines,
+    )
+
+
+def apart(new: MovingSurfaces, known: MovingSurfaces, times: np.ndarray) -> list[int]:
+    """Numbers of `new` bodies that are bodies of their own beside `known` ones.
+
+    Their centres lie `CENTRES` of the larger radius away from all of these, averaged over times; and they are either
+    `PART` of the median volume of these, at least, or touch none: small pieces at the surface of a body correct its
+    shape, which the next fit does better.
+    """
+    distances = np.zeros((new.count, known.count))
+    for time in times:
+        ours, theirs = ([_ball(mesh) for mesh in of.bodies(float(time))] for of in (new, known))
+        for i, (centre, radius) in enumerate(ours):
+            for j, (other, size) in enumerate(theirs):
+                distances[i, j] += np.linalg.norm(centre - other) / max(radius, size) / len(times)
+    middle = float(times[len(times) // 2])
+    least = PART * np.median([abs(mesh.volume) for mesh in known.bodies(middle)])
+    large = np.array([abs(mesh.volume) >= least for mesh in new.bodies(middle)])
+    own = (distances.min(1) >= CENTRES) & (large | (gaps(new, known, times) > NEAR_PX))
+    return [int(k) for k in np.flatnonzero(own)]
+
+
+def sure_ones(bodies: MovingSurfaces, views: Views, times: np.ndarray) -> list[int]:
+    """Numbers of the bodies of `SURE` of the median volume at least, and of those that the field cuts in the middle.
+
+    Of the others few views have smeared a part, or made them up where streaks of several cross; one is left at least.
+    """
+    meshes = bodies.bodies(float(times[len(times) // 2]))
+    cut = np.array([is_cut(mesh, views) for mesh in meshes])
+    volumes = np.array([abs(mesh.volume) for mesh in meshes])
+    middle = np.median(volumes if cut.all() else volumes[~cut])
+    return [int(k) for k in np.flatnonzero(cut | (volumes >= SURE * middle))]
+
+
+def gaps(of: MovingSurfaces, others: MovingSurfaces, times: np.ndarray) -> np.ndarray:
+    """[N] how near the vertices of each body `of` come to those of `others`, in the median over times [pixels]."""
+    found = np.zeros((len(times), of.count))
+    for t, time in enumerate(times):
+        tree = KDTree(np.concatenate([mesh.vertices for mesh in others.bodies(float(time))]))
+        found[t] = [tree.query(mesh.vertices)[0].min() / of.unit_length for mesh in of.bodies(float(time))]
+    return np.asarray(np.median(found, axis=0))
+
+
+def whole_ones(bodies: MovingSurfaces, times: np.ndarray) -> list[int]:
+    """Numbers of the bodies that are no pieces of others: of `PART` of the median volume at least, or touching none.
+
+    What is left out is looked for again, beside the others.
+    """
+    if bodies.count == 1:
+        return [0]
+    middle = float(times[len(times) // 2])
+    volumes = np.array([abs(mesh.volume) for mesh in bodies.bodies(middle)])
+    small = np.flatnonzero(volumes < PART * np.median(volumes))
+    large = np.setdiff1d(np.arange(bodies.count), small)
+    touching = [] if not len(small) else gaps(only(bodies, small.tolist()), only(bodies, large.tolist()), times)
+    pieces = {int(k) for k, gap in zip(small, touching) if gap <= NEAR_PX}
+    return [k for k in range(bodies.count) if k not in pieces]
+
+
+def _ball(mesh: TriangleMesh) -> tuple[np.ndarray, float]:
+    """Middle of the vertices [3] [m], and radius [m] of the ball of the same volume."""
+    return mesh.vertices.mean(0), float((3 * abs(mesh.volume) / (4 * np.pi)) ** (1 / 3))
+
+
+MOST, LEAST = 0.5, 0.1
+"""Shares of a body that lie in others: in all of them together, and in each of two at least, of a merger."""
+LOOKS = 4
+"""Times that are looked at, about."""
+VOXELS = 20_000
+"""Of the grid on which a body and those in it are compared, at most."""
+
+
+def without_merger(bodies: MovingSurfaces, times: np.ndarray) -> MovingSurfaces:
+    """`bodies` without the one that lies in others most, if that is a merger: most of it is in two others or more.
+
+    Few beams show two bodies that touch as one between them. Each is then found beside it, in the shadow that it
+    leaves, and none of the three can become what it is as long as the merger takes the middle.
+    """
+    seen = times[:: max(1, len(times) // LOOKS)]
+    shares = np.mean([shared(bodies, float(time)) for time in seen], axis=0)
+    shares[shares < LEAST] = 0
+    merged = np.where((shares > 0).sum(1) >= 2, shares.sum(1), 0.0)
+    worst = int(merged.argmax())
+    return bodies if merged[worst] < MOST else only(bodies, [k for k in range(bodies.count) if k != worst])
+
+
+def shared(bodies: MovingSurfaces, time: float) -> np.ndarray:
+    """[B, B] the share of each body's volume that lies in each other one at `time` [s]."""
+    meshes, found = bodies.bodies(time), np.zeros((bodies.count, bodies.count))
+    low, high = (np.array([reach(mesh.vertices, axis=0) for mesh in meshes]) for reach in (np.min, np.max))
+    meet = np.all((low[:, None] <= high[None]) & (low[None] <= high[:, None]), axis=2)
+    for i in np.flatnonzero(meet.sum(1) > 1):
+        grid = Grid.around(meshes[i].vertices / bodies.unit_length, bodies.unit_length, VOXELS)
+        own = _occupied(bodies, int(i), time, grid)
+        for j in (int(j) for j in np.flatnonzero(meet[i]) if j != i):
+            found[i, j] = (own * _occupied(bodies, j, time, grid)).sum() / own.sum()
+    return found
+
+
+def _occupied(bodies: MovingSurfaces, number: int, time: float, grid: Grid) -> np.ndarray:
+    return only(bodies, [number]).at(time).voxelise(grid).delta / bodies.matter.delta

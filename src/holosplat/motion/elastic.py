@@ -1,4 +1,4 @@
-"""Elastic energy of bodies of known rest shape as a prior: that of their membranes, in likelihoods.
+"""Elastic energy of bodies of known rest shape as a prior, and the terms of a fit of bodies in motion.
 
 Frames decide what they can see of a shape; what they cannot see, the rest shape decides. The membrane is that of
 `specimens.membrane`: Skalak's shear and dilation, bending of its edges, its whole area. Moduli go with the body's size,
@@ -7,23 +7,26 @@ so that a body twice as large and deformed alike costs as much.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
+from scipy.sparse import csr_array, eye_array
+from scipy.spatial import KDTree
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from ..bodies.rest_shape import surface
 from ..checks import require
 from ..fit.problem import Batch, LossPart
+from ..fit.terms.object import squared_product
 from ..mesh import TriangleMesh
 from ..model import Model
 from ..representations import MovingSurfaces
+from ..representations.isosurface import neighbour_mean
 from ..specimens.membrane.model import Elasticity, Membrane
-from .terms import COEFFICIENTS
 
 BENDING, AREA = 8e-3, 345.0
 """Bending of an edge over shear modulus and squared radius, and the area's modulus over that of shear: of red cells
@@ -124,3 +127,155 @@ def strain_energy(
         nodes = np.stack([mesh.vertices for mesh in bodies.bodies(float(time))])
         found.append(membrane.energy(torch.from_numpy(nodes)).numpy())
     return np.array(found)
+
+
+COEFFICIENTS = "object.coefficients"
+
+Size = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""What triangles of the corners a, b, c [F, 3] add to a size of a body: [F]."""
+
+
+class MovingBending:
+    """The mean over times of Σ |L² x|² of the vertices x [pixels], L x their distance from their neighbours' mean."""
+
+    names = ("bending",)
+
+    def __init__(self, weight: float, start: MovingSurfaces, times: np.ndarray) -> None:
+        """times: [T] s, over which the mean is taken."""
+        count = start.coefficients.shape[1]
+        away = csr_array(eye_array(count) - neighbour_mean(start.faces.numpy(), count))
+        operator = csr_array(away @ away)
+        self._weight, self._operators = weight, (operator, csr_array(operator.T))
+        self._root = torch.from_numpy(square_root(start.basis.gram(times)))
+        self.resolved = {"bending": weight}
+
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
+        """The one part."""
+        paths = torch.einsum("kl,lpx->pkx", self._root, model.parameters()[COEFFICIENTS])
+        return [LossPart("bending", self._weight, squared_product(paths.flatten(1), *self._operators))]
+
+
+class Acceleration:
+    """The mean over vertices of the squared coefficients of their acceleration [pixels² per piece⁴]."""
+
+    names = ("acceleration",)
+
+    def __init__(self, weight: float, start: MovingSurfaces) -> None:
+        self._weight = weight
+        self._curvature = torch.from_numpy(start.basis.curvature())
+        self.resolved = {"acceleration": weight}
+
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
+        """The one part."""
+        paths = model.parameters()[COEFFICIENTS]
+        bent: Tensor = torch.einsum("jk,kpx->jpx", self._curvature, paths)
+        return [LossPart("acceleration", self._weight, bent.square().sum() / paths.shape[1])]
+
+
+class SizeKept:
+    """Σ over bodies of the mean over times of (S(t)/S - 1)², S(t) a size of a body and S its mean over time."""
+
+    def __init__(self, name: str, size: Size, weight: float, start: MovingSurfaces, times: np.ndarray) -> None:
+        """name: of the part; size: one number of each triangle, whose sum is that of the body; times: [T] s, over which
+        means are taken."""
+        self.names, self._size, self._weight = (name,), size, weight
+        self._faces, self._body, self._count = start.faces, start.of_body, start.count
+        self._weights = torch.from_numpy(start.basis.weights(times))
+        self.resolved = {name: weight}
+
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
+        """The one part."""
+        paths = model.parameters()[COEFFICIENTS]
+        sizes = torch.stack([self._sizes(torch.einsum("k,kpx->px", w, paths)) for w in self._weights])
+        change = sizes / sizes.mean(0) - 1
+        return [LossPart(self.names[0], self._weight, change.square().mean(0).sum())]
+
+    def _sizes(self, vertices: Tensor) -> Tensor:
+        """[B] of all bodies, about the middle of all vertices."""
+        parts = self._size(*(vertices - vertices.detach().mean(0))[self._faces].unbind(1))
+        return vertices.new_zeros(self._count).index_add(0, self._body, parts)
+
+
+def volume_kept(weight: float, start: MovingSurfaces, times: np.ndarray) -> SizeKept:
+    """The penalty on changes of the volume of each body."""
+    return SizeKept("volume_kept", _tetrahedra, weight, start, times)
+
+
+def area_kept(weight: float, start: MovingSurfaces, times: np.ndarray) -> SizeKept:
+    """The penalty on changes of the area of each body."""
+    return SizeKept("area_kept", _triangles, weight, start, times)
+
+
+def _tetrahedra(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
+    """Signed volumes [F] between the origin and triangles of the corners a, b, c [F, 3]."""
+    return (a * torch.linalg.cross(b, c)).sum(1) / 6
+
+
+def _triangles(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
+    """Areas [F] of triangles of the corners a, b, c [F, 3]."""
+    return 0.5 * torch.linalg.cross(b - a, c - a).norm(dim=1)
+
+
+def square_root(gram: np.ndarray) -> np.ndarray:
+    """R [K, K] with Rᵀ R = `gram` [K, K], positive semi-definite."""
+    values, axes = np.linalg.eigh(gram)
+    return np.sqrt(np.maximum(values, 0))[:, None] * axes.T
+
+
+class Apart:
+    """The mean over times of Σ over surfaces ∫ d² dA [pixels⁴], d the depth of a point in another body.
+
+    The depth of a vertex is its distance from the tangent plane at the nearest vertex of the other body (whose normal
+    tells inside from outside: Bærentzen & Aanæs 2005, IEEE Trans. Vis. Comput. Graph. 11, 243). Bodies whose boxes do
+    not meet are not looked at; areas are those of the start. A step looks at the times of its own frames.
+    """
+
+    names = ("apart",)
+
+    def __init__(self, weight: float, start: MovingSurfaces, times: np.ndarray) -> None:
+        """times: [N] s, of the frames."""
+        self._weight, self._basis, self._times = weight, start.basis, times
+        self._vertices = [start.body(k)[0].numpy() for k in range(start.count)]
+        self._faces = start.faces
+        corners = start.at(start.basis.first).vertices.detach()[start.faces]
+        areas = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).norm(dim=1) / 6
+        self._areas = torch.zeros(start.coefficients.shape[1], dtype=torch.float64)
+        self._areas.index_add_(0, start.faces.reshape(-1), areas.repeat_interleave(3))
+        self.resolved = {"apart": weight}
+
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
+        """The one part."""
+        paths = model.parameters()[COEFFICIENTS]
+        shown = self._times if batch.index is None else self._times[batch.index.numpy()]
+        times = np.unique(shown)
+        places = (torch.einsum("k,kpx->px", torch.from_numpy(w), paths) for w in self._basis.weights(times))
+        return [LossPart("apart", self._weight, torch.stack([self.overlap(vertices) for vertices in places]).mean())]
+
+    def overlap(self, vertices: Tensor) -> Tensor:
+        """Σ ∫ d² dA [] of surfaces with `vertices` [P, 3] [pixels], over the parts that lie in other bodies."""
+        points = vertices.detach().numpy()
+        found = list(self._near(points))
+        if not found:
+            return vertices.new_zeros(())
+        own, other = (torch.from_numpy(np.concatenate(part)) for part in zip(*found))
+        depth = -((vertices[own] - vertices[other]) * self._normals(vertices)[other]).sum(1)
+        return (self._areas[own] * depth.clamp_min(0).square()).sum()
+
+    def _near(self, points: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Vertices in the box of another body, and the vertices of that one that are nearest to them."""
+        bodies = [points[used] for used in self._vertices]
+        low, high = (np.array([reach(body, axis=0) for body in bodies]) for reach in (np.min, np.max))
+        meet = np.all((low[:, None] <= high[None]) & (low[None] <= high[:, None]), axis=2)
+        for j in np.flatnonzero(meet.sum(1) > 1):
+            tree = KDTree(bodies[j])
+            for i in np.flatnonzero(meet[j]):
+                inside = np.flatnonzero(np.all((bodies[i] >= low[j]) & (bodies[i] <= high[j]), axis=1))
+                if i != j and len(inside):
+                    yield self._vertices[i][inside], self._vertices[j][tree.query(bodies[i][inside])[1]]
+
+    def _normals(self, vertices: Tensor) -> Tensor:
+        """Unit normals [P, 3], means of those of the triangles around by area."""
+        a, b, c = vertices[self._faces].unbind(1)
+        across = torch.linalg.cross(b - a, c - a)
+        sums = torch.zeros_like(vertices).index_add(0, self._faces.reshape(-1), across.repeat_interleave(3, 0))
+        return sums / sums.norm(dim=1, keepdim=True).clamp_min(1e-30)

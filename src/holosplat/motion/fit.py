@@ -26,8 +26,7 @@ from ..ranges import Rate, Weight, ranged
 from ..representations import MovingSurfaces
 from ..representations.isosurface import adjacency
 from ..scan import Scan
-from .elastic import Rest, RestShapeKept
-from .terms import COEFFICIENTS, Acceleration, Apart, MovingBending, area_kept, volume_kept
+from .elastic import COEFFICIENTS, Acceleration, Apart, MovingBending, Rest, RestShapeKept, area_kept, volume_kept
 
 OPEN = 1e-3
 """Share of the times' mean square below which a coefficient is taken to be seen so well: what frames hardly see of a

@@ -42,9 +42,8 @@ from ..representations import (
 )
 from ..representations.initialise import FILLED
 from ..scan import Scan
-from .freer_flow import Change, freer_flows
-from .journal import Journal, Nowhere
-from .timed_frames import Frames, iterations_that_predict, kept_frames, likelihood_ratio, merged
+from .timed_frames import Change, Frames, freer_flows, iterations_that_predict, kept_frames, likelihood_ratio, merged
+from .track_options import Journal, Nowhere
 
 MOTION, STILL, FLOW = "motion", "matter at rest", "steady flow"
 FREEDOM, BY = "freedom of the flow", "frames set aside"

@@ -8,10 +8,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from ..bodies.moments import moments, stretched_like
 from ..bodies.neighbourhood_search import Heard
 from ..bodies.poses import Pose
-from ..bodies.rest_shape import KnownBody
+from ..bodies.rest_shape import KnownBody, moments, stretched_like
 from ..bodies.search import BodySearch, sized
 from ..bodies.shadows import Shadows
 from ..checks import require

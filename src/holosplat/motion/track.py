@@ -8,8 +8,8 @@ from typing import Any
 
 import torch
 
+from ..bodies.poses import two_beams
 from ..bodies.rest_shape import KnownBody, guessed_cells
-from ..bodies.twin import two_beams
 from ..checks import InputError, as_written
 from ..inference import Score, select
 from ..matter import DeltaBeta
@@ -17,9 +17,8 @@ from ..optics.background import Light
 from ..progress import FitProgress
 from ..scan import Scan
 from .body_tracker import BodyTracker, Followed, require_times
-from .journal import Journal, Nowhere
-from .residual_detection import predicted
-from .track_options import TrackOptions
+from .detections import predicted
+from .track_options import Journal, Nowhere, TrackOptions
 
 NAME, CELLS, ANY = "shape of the bodies", "red cells", "any shape"
 

@@ -1,4 +1,4 @@
-"""The two-view ambiguity: a body or its twin (`bodies.twin`), compared by fits to the frames of two beams."""
+"""The two-view ambiguity: a body or its twin (`bodies.poses`), compared by fits to the frames of two beams."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from ..bodies.moments import moments, second_moments
-from ..bodies.twin import distance, map_near, twin_map, two_beams
+from ..bodies.poses import distance, map_near, twin_map, two_beams
+from ..bodies.rest_shape import moments, second_moments
 from ..fit.running import Steps
 from ..inference import Compared, Decision, Score
 from ..mesh import TriangleMesh
 from ..optics.background import Light
 from ..representations import MovingSurfaces
 from ..scan import Scan
+from .detections import beside, only, predicted
 from .elastic import Rest
 from .fit import MotionFit, motion_fit
-from .residual_detection import beside, only, predicted
 
 APART = 0.05
 """Least distance of a body and its twin, over its extent, at which they can be distinguished."""

@@ -179,7 +179,7 @@ class Needs:
 
 @dataclass(frozen=True)
 class Seen:
-    """The properties of frames that change it (`planning.seen`). windows: sizes of windows, None for whole frames;
+    """The properties of frames that change it (`scan_facts`). windows: sizes of windows, None for whole frames;
     noisy: whether surfaces begin with Gaussians, and may take turns with a volume."""
 
     windows: Sizes | None = None

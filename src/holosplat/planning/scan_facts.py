@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,24 +15,35 @@ from typing import Any
 
 import numpy as np
 
+from ..baselines import HolographicTV
 from ..checks import InputError, UnsaidError
 from ..io.angles import angles_of
 from ..io.facts import Facts, keys_of
-from ..io.kept_frames import with_fields
-from ..io.loader import Loader
-from ..io.raw_file import DARK, FLAT, INVALID, NAMES, PROJECTION, ScanFile
+from ..io.raw_file import DARK, FLAT, INVALID, NAMES, PROJECTION, Loader, ScanFile
 from ..io.reading import Reading
-from ..io.stored_frames import StoredFrames
+from ..io.stored_frames import StoredFrames, with_fields
 from ..matter import MatterKind
-from ..methods import Auto
+from ..methods import Auto, HolographicVoxels, Method, NeuralFields, Surfaces, Voxels
+from ..methods.gaussians import Gaussians
+from ..methods.window import windows_of
+from ..optics.noise import noise_levels, noise_share
+from ..optics.noise_model import NoiseModel
 from ..optics.sampling import fringes
 from ..scan import Exposures, Scan
 from ..units import span
 from .acts import of_each_time
 from .look import LOOKED, Look, looked
-from .needs import Sizes, of_choice, of_reconstruction, require_room, time_in_words
-from .seen import seen_of
-from .smaller import smaller
+from .needs import (
+    UNSEEN,
+    Needs,
+    Seen,
+    Sizes,
+    of_choice,
+    of_reconstruction,
+    on_larger_pixels,
+    require_room,
+    time_in_words,
+)
 
 FIELDS = 3
 """Flats, and darks, that are read."""
@@ -230,3 +241,75 @@ def _needs(scan: Scan, numbers: np.ndarray) -> dict[str, str]:
             f"up to about {time_in_words(choice)} more, where fits decide between the two (--matter says it)"
         )
     return rows
+
+
+MOST_PIXELS = 100_000_000
+"""Of all frames that are looked at: more take longer than an estimate is worth."""
+
+
+def can_be_seen(scan: Scan) -> bool:
+    """Whether the frames of `scan` are few enough to be looked at before all else."""
+    rows, columns = scan.views.shape
+    return 0 < len(scan) * rows * columns <= MOST_PIXELS
+
+
+def seen_of(scan: Scan, method: Method, whole: bool = False) -> Seen:
+    """Measure the training frames of `scan`; nothing where all frames are too many, or of several times.
+
+    whole: whether a run works on whole frames whatever they show, as with free poses. Noise counts as white here, and
+    light as even: in other light windows hold whole frames.
+    """
+    if not can_be_seen(scan) or scan.is_series:
+        return UNSEEN
+    scan = scan.train().in_memory()
+    noise = NoiseModel.white_only(noise_levels(scan.measured), scan.views.shape)
+    windows = None if whole else windows_of(scan, noise)
+    worked = scan if windows is None else windows.of(scan)
+    return Seen(None if windows is None else Sizes.of(worked.exposures), _is_noisy(worked, method))
+
+
+def _is_noisy(scan: Scan, method: Method) -> bool:
+    """Whether surfaces begin as they do in noise, on the pixels that they begin on (`methods.first_surfaces`)."""
+    gaussians = getattr(method, "gaussians", None)
+    if not isinstance(gaussians, Gaussians):
+        return False
+    factor = gaussians.coarse.factor(scan.views.shape)
+    coarse = scan.binned(factor) if factor > 1 else scan
+    return noise_share(coarse.measured) > gaussians.volume.noisy
+
+
+BINNINGS, FEWEST_COLUMNS = range(2, 9), 11
+"""What is tried for --bin, and columns that must be left."""
+
+
+def smaller(exposures: Exposures, method: Method, matter: MatterKind | None) -> Iterator[tuple[str, Needs]]:
+    """The same reconstruction on larger voxels in the start, and on larger pixels; how, and what it takes then."""
+    flag, coarse = _one_voxel_a_pixel(method)
+    for factor in (1, *BINNINGS):
+        if factor > 1 and exposures.views.shape[1] // factor < FEWEST_COLUMNS:
+            return
+        sizes, bins = Sizes.of(exposures, factor), f"--bin {factor}" if factor > 1 else ""
+        for how, tried in ((bins, method), (f"{bins} {flag}".strip(), coarse)):
+            needs = of_reconstruction(sizes, tried, matter)
+            if needs is not None and how:
+                yield how, needs
+
+
+def coarser(exposures: Exposures, of: Callable[[Exposures], Needs]) -> Iterator[tuple[str, Needs]]:
+    """What `of` says of the same frames on larger pixels; how, and what it takes then."""
+    for factor in BINNINGS:
+        if exposures.views.shape[1] // factor < FEWEST_COLUMNS:
+            return
+        yield f"--bin {factor}", of(on_larger_pixels(exposures, factor))
+
+
+def _one_voxel_a_pixel(method: Method) -> tuple[str, Method]:
+    """A method whose start has voxels of one pixel, and the flag that makes it so; none where it has no such start."""
+    start = getattr(method, "volume", None)
+    if isinstance(start, HolographicTV) and isinstance(method, Gaussians | HolographicVoxels | Voxels | NeuralFields):
+        return "--set volume.refine=1", replace(method, volume=replace(start, refine=1))
+    if isinstance(method, Auto | Surfaces):
+        gaussians = method.gaussians
+        coarse = replace(gaussians, volume=replace(gaussians.volume, refine=1))
+        return "--set gaussians.volume.refine=1", replace(method, gaussians=coarse)
+    return "", method

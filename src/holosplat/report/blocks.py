@@ -27,7 +27,6 @@ from .figures import (
     slice_titles,
     slices_figure,
 )
-from .forecast_shown import forecast_block
 from .light import light_figure
 from .moving_figures import motion_blocks
 from .style import (
@@ -48,6 +47,7 @@ from .style import (
     scientific,
     styled,
 )
+from .surface import forecast_block
 from .view3d.view import html
 
 MOST_VIEWS = 4

@@ -18,8 +18,8 @@ from ..units import wavenumber
 from ..volume import Volume
 from ..workflows.totals import TotalMatter
 from ..workflows.verdict import Verdict
-from .forecast_shown import ForecastShown
 from .style import scientific
+from .surface import ForecastShown
 from .view3d.view import View3D
 
 

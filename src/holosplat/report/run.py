@@ -13,8 +13,8 @@ import torch
 
 from ..checks import as_written
 from ..geometry import Grid, Views
-from ..io.guess import read_guess
 from ..io.json import read_json
+from ..io.volumes import read_guess
 from ..methods import METHODS, learned
 from ..motion.measures import columns, measured
 from ..optics.background import Light
@@ -31,11 +31,10 @@ from ..workflows.run_folder import RunFolder
 from ..workflows.track import read_errors
 from .content import GuessShown, HeldOutViews, LitViews, Moving, ProjectedMaps, ReportContent, view_labels
 from .figures import evenly_chosen
-from .forecast_shown import ForecastShown
 from .page import write_report
 from .style import data_uri, new_figure, styled
-from .view3d.parts import SLICE_BYTES, VOLUME_BYTES, part_of, volume_part
-from .view3d.view import View3D, raster_of
+from .surface import ForecastShown
+from .view3d.view import SLICE_BYTES, VOLUME_BYTES, View3D, part_of, raster_of, volume_part
 
 MOST_FRAMES = 24
 """Times that the animation of a report shows, at most."""

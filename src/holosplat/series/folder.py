@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ..checks import as_written, require
-from ..io.folder import atomic_folder, require_new
+from ..io.atomic import atomic_folder, require_new
 from ..io.json import read_json, write_json
 from ..io.lock import Writer, writer_of
 from ..tables import from_table

@@ -15,7 +15,7 @@ from ..checks import InputError, MissingError, require
 from ..io.atomic import atomic_path
 from ..io.lock import TakenError
 from .folder import FAILED, SeriesFolder, TaskState, cores
-from .settings import Slurm
+from .plan import Slurm
 from .task import OnRow, nothing, run_task
 
 MOST_SECONDS = 60

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..bodies.moments import moments
+from ..bodies.rest_shape import moments
 from ..checks import InputError, is_of_memory, require
 from ..io.formats import read_frames
 from ..io.json import write_json

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ..bodies.moments import moments
+from ..bodies.rest_shape import moments
 from ..checks import InputError
 from ..io.atomic import atomic_path
 from ..matter import MaterialPrior
@@ -25,7 +25,7 @@ from ..workflows.reconstruct import reconstruct
 from ..workflows.reconstruction import Reconstruction
 from ..workflows.run_folder import RunFolder, claimed
 from .folder import Begun, Body, Row
-from .settings import Settings
+from .plan import Settings
 
 PHASE = "phase.npy"
 """The phase in the first view [rad], for pages."""

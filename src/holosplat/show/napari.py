@@ -14,9 +14,9 @@ import numpy as np
 from ..checks import InputError
 from ..geometry import Grid
 from ..io.compact import FORMAT as COMPACT
-from ..io.gaussians import FORMAT as GAUSSIANS
 from ..io.hdf5 import open_hdf5
 from ..io.objects import FORMAT, read_object
+from ..io.objects import GAUSSIANS_FORMAT as GAUSSIANS
 from ..io.volumes import NAMES, read_volume
 from ..representations import InMotion, Stored, SurfaceMesh
 from ..volume import Volume

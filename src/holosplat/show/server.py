@@ -5,7 +5,9 @@ from __future__ import annotations
 import hmac
 import logging
 import secrets
-from collections.abc import Iterator, Mapping, Sequence
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
@@ -17,8 +19,9 @@ import numpy as np
 
 from ..checks import InputError, require
 from ..mesh import TriangleMesh
+from ..representations import Stored
 from ..units import format_length
-from .parts import COLOUR, HALF_EDGE, Frame, Shown, Splats, legend
+from .parts import COLOUR, HALF_EDGE, Frame, Shown, Splats, legend, shown
 
 
 def require_viser() -> Any:
@@ -233,3 +236,63 @@ class Guard:
 
     def _is(self, token: str) -> bool:
         return hmac.compare_digest(token.encode("utf-8", "replace"), self.token.encode())
+
+
+INTERVAL_S = 1.0
+"""Seconds between updates, at least."""
+SHARE = 0.01
+"""Share of the time that updates may take by what they cost in this process; sending them comes beside it."""
+
+
+class Watch:
+    """Callbacks from a fit to a view: `on_progress` and `on_state` of `reconstruct`.
+
+    The object is taken at the end of a step, of the first one of a stage always, and drawn by another thread. The next
+    update waits until the last one's cost is `SHARE` of the time. While no browser is there, only words are kept, and
+    nothing is drawn.
+    """
+
+    def __init__(self, view: LiveView) -> None:
+        self._view = view
+        self._next, self._cost, self._stage = 0.0, 0.0, ""
+        self._busy = threading.Event()
+
+    def on_progress(self, stage: str, fraction: float, record: dict[str, float]) -> None:
+        """A stage that goes on, as words."""
+        if not record and time.perf_counter() >= self._next:
+            self._next = time.perf_counter() + INTERVAL_S
+            self._view.tell(f"{stage}: {fraction:.0%}")
+
+    def on_state(self, stage: str, fraction: float, record: dict[str, float], state: Callable[[], Stored]) -> None:
+        """A step of a fit: words, and the object where a browser looks."""
+        now = time.perf_counter()
+        if (now < self._next and stage == self._stage) or self._busy.is_set():
+            return
+        self._stage, self._next = stage, now + INTERVAL_S
+        self._view.tell(*words(stage, fraction, record))
+        if not self._view.watched:
+            return
+        began = time.thread_time()
+        found = state()
+        self._cost = time.thread_time() - began
+        self._busy.set()
+        threading.Thread(target=self._draw, args=(found,), daemon=True).start()
+
+    def _draw(self, found: Stored) -> None:
+        began = time.thread_time()
+        try:
+            if self._view.frame is None:
+                self._view.frame = Frame.around(found.enclosing_grid(1))
+            self._view.show(shown(found))
+        finally:
+            cost = self._cost + time.thread_time() - began
+            self._next = time.perf_counter() + max(INTERVAL_S, cost / SHARE)
+            self._busy.clear()
+
+
+def words(stage: str, fraction: float, record: dict[str, float]) -> list[str]:
+    """The description of a step."""
+    numbers = {name: record[name] for name in ("loss", "count") if name in record}
+    said = [f"{stage}: {fraction:.0%}", f"step {record.get('step', 0):.0f}"]
+    said += [f"loss {numbers['loss']:.4g}"] if "loss" in numbers else []
+    return said + ([f"{numbers['count']:.0f} Gaussians"] if "count" in numbers else [])

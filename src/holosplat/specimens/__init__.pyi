@@ -1,5 +1,3 @@
-from .capsules import Capsule as Capsule
-from .capsules import place_capsules as place_capsules
 from .carried import CarriedScene as CarriedScene
 from .carried import Twist as Twist
 from .carried import collapsing_foam as collapsing_foam
@@ -19,15 +17,17 @@ from .fluids import Bubbles as Bubbles
 from .fluids import Cuvette as Cuvette
 from .fluids import Jet as Jet
 from .fluids import Shock as Shock
-from .foam import Foam as Foam
-from .foam import random_foam as random_foam
 from .membrane.model import Elasticity as Elasticity
 from .membrane.model import Membrane as Membrane
+from .membrane.model import stretch as stretch
 from .membrane.resting import resting_cell as resting_cell
-from .membrane.tweezers import stretch as stretch
 from .mesh_series import MeshSeries as MeshSeries
 from .phantoms import Ball as Ball
+from .phantoms import Capsule as Capsule
+from .phantoms import Foam as Foam
 from .phantoms import packed_balls as packed_balls
+from .phantoms import place_capsules as place_capsules
+from .phantoms import random_foam as random_foam
 from .phantoms import star_of_balls as star_of_balls
 from .red_cells import crowded_cells as crowded_cells
 from .red_cells import evans_fung_cell as evans_fung_cell

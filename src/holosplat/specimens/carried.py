@@ -18,8 +18,8 @@ from ..checks import finite, in_range, require
 from ..geometry import Grid, Views
 from ..matter import DeltaBeta
 from ..volume import LineIntegrals, Volume
-from .continuous import Bump, ContinuousScene, Element, Soft, ellipsoid, random_rotation
-from .foam import random_foam
+from .continuous import Bump, ContinuousScene, Element, Soft, ellipsoid, random_direction, random_rotation, scaled
+from .phantoms import random_foam
 
 CORE = 0.93
 """Share of a bubble's radius within which gas is lost: its sharp inside, less what other bubbles distort it by."""
@@ -44,13 +44,15 @@ def stirred_blob(
     rng = np.random.default_rng(seed)
     semi = radius * np.array([0.85, *rng.uniform(0.62, 0.8, 2)])
     body = random_rotation(rng)
-    elements = [ellipsoid(np.zeros(3), semi, Soft(0.3), _times(material, 0.6), body, 0.3 / radius * _direction(rng))]
+    elements = [
+        ellipsoid(np.zeros(3), semi, Soft(0.3), scaled(material, 0.6), body, 0.3 / radius * random_direction(rng))
+    ]
     for k in range(14):
         size = radius * rng.uniform(0.16, 0.28)
-        place = _direction(rng) * rng.uniform(0.1, 0.8) ** (1 / 3) * (semi - size) @ body.T
+        place = random_direction(rng) * rng.uniform(0.1, 0.8) ** (1 / 3) * (semi - size) @ body.T
         level = (0.9, -0.45)[k % 2] * rng.uniform(0.6, 1)
         lengths = size * np.array([1.0, *rng.uniform(0.7, 1.0, 2)])
-        elements.append(ellipsoid(place, lengths, Bump(2), _times(material, level), random_rotation(rng)))
+        elements.append(ellipsoid(place, lengths, Bump(2), scaled(material, level), random_rotation(rng)))
     angle, rate = rng.uniform(0, math.pi), turn / duration
     first = Twist((0.0, 0.0, 0.0), (0.0, 1.0, 0.0), rate, diameter / 3)
     second = Twist((0.0, 0.0, 0.0), (math.cos(angle), 0.0, math.sin(angle)), 2 / 3 * rate, diameter / 3)
@@ -88,19 +90,10 @@ def collapsing_foam(
     sinks: list[Sink] = []
     for ball, share in zip(foam.bubbles, np.minimum(shares, MOST_LOST)):
         r = 0.5 * ball.diameter
-        elements.append(ellipsoid(ball.centre, np.full(3, r), Soft(edge / r), _times(material, -1.0)))
+        elements.append(ellipsoid(ball.centre, np.full(3, r), Soft(edge / r), scaled(material, -1.0)))
         x, y, z = ball.centre.tolist()
         sinks.append(Sink((x, y, z), CORE * (r - 0.5 * edge), float(share) / duration * ball.volume))
     return CarriedScene(ContinuousScene(tuple(elements)), Sinks(tuple(sinks)), radius, edge / EDGE_POINTS)
-
-
-def _direction(rng: np.random.Generator) -> np.ndarray:
-    found = rng.normal(size=3)
-    return found / np.linalg.norm(found)
-
-
-def _times(matter: DeltaBeta, factor: float) -> DeltaBeta:
-    return DeltaBeta(factor * matter.delta, factor * matter.beta)
 
 
 CHUNK = 1 << 15

@@ -270,6 +270,17 @@ def ellipsoid(
     return Element(np.asarray(centre, dtype=np.float64), turned, profile, matter, np.asarray(gradient))
 
 
+def random_direction(rng: np.random.Generator) -> np.ndarray:
+    """A unit vector [3], all directions equally likely."""
+    found = rng.normal(size=3)
+    return found / np.linalg.norm(found)
+
+
+def scaled(matter: DeltaBeta, factor: float) -> DeltaBeta:
+    """The same ratio of δ to β, `factor` times denser."""
+    return DeltaBeta(factor * matter.delta, factor * matter.beta)
+
+
 def random_rotation(rng: np.random.Generator) -> np.ndarray:
     """A rotation matrix [3, 3], all of them equally likely (Shoemake 1992, Graphics Gems III, 124)."""
     w, x, y, z = (q := rng.normal(size=4)) / np.linalg.norm(q)

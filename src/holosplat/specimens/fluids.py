@@ -15,10 +15,9 @@ from ..checks import InputError, require
 from ..mesh import TriangleMesh
 from ..ranges import Many, ManyOrNone, Share, Small, SomeShare, ranged
 from .continuous import NODES, WEIGHTS, ContinuousScene, Soft, ellipsoid
-from .drawn import LONG, SHARE, Drawn, Substances, ball_meshes, meshed, region
+from .drawn import LONG, SHARE, Drawn, Substances, ball_meshes, column, lathe, meshed, region
 from .phantoms import Ball
 from .rods import RodScene, random_bubbles
-from .shapes import column, lathe
 
 PIECES = 8
 """Pieces of a ray that are integrated one by one: with a tail of a twentieth, right to 1e-6 of the largest integral."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..checks import in_range, require
 from ..matter import DeltaBeta
-from .continuous import Bump, ContinuousScene, Element, Soft, ellipsoid, random_rotation
+from .continuous import Bump, ContinuousScene, Element, Soft, ellipsoid, random_direction, random_rotation, scaled
 from .phantoms import packed_balls
 
 Box = tuple[float, float, float]
@@ -92,7 +92,7 @@ def tissue(box: Box, material: DeltaBeta, seed: int = 0, cells: int = 40, granul
     require(granules >= 0, f"granules must not be negative, but it is {granules}.")
     semi = 0.5 * np.array([in_range("box extent", b, 1e-9, 10.0, unit="metres") for b in box])
     rng, least = np.random.default_rng(seed), float(semi.min())
-    ground = ellipsoid(np.zeros(3), semi / 1.05, Soft(0.1), material, gradient=0.15 / least * _direction(rng))
+    ground = ellipsoid(np.zeros(3), semi / 1.05, Soft(0.1), material, gradient=0.15 / least * random_direction(rng))
     elements = [ground]
     for ball in packed_balls(rng.uniform(0.2, 0.36, cells), (1.7, 1.7, 1.7), rng, margin=0.01, shape="ball"):
         level, radius = rng.uniform(-0.12, 0.35), 0.5 * ball.diameter * least
@@ -101,13 +101,13 @@ def tissue(box: Box, material: DeltaBeta, seed: int = 0, cells: int = 40, granul
         level, width = (-0.55, 0.07) if kind < 3 else (0.45, 0.04)
         centre = 0.35 * rng.uniform(-1, 1, 3) * semi
         lengths = least * np.array([0.5, width, width * rng.uniform(0.7, 1)])
-        matter = _times(material, level)
+        matter = scaled(material, level)
         elements.append(ellipsoid(centre, lengths, Soft(0.4), matter, random_rotation(rng)))
     for i in range(granules):
         radius = least * (0.12 if i % 4 == 0 else 0.05)
         level = rng.choice([-1, 1]) * rng.uniform(0.03, 0.1)
-        place = _direction(rng) * rng.uniform() ** (1 / 3) * (0.9 * semi - radius)
-        elements.append(ellipsoid(place, np.full(3, radius), Bump(2), _times(material, level)))
+        place = random_direction(rng) * rng.uniform() ** (1 / 3) * (0.9 * semi - radius)
+        elements.append(ellipsoid(place, np.full(3, radius), Bump(2), scaled(material, level)))
     return ContinuousScene(tuple(elements))
 
 
@@ -127,7 +127,7 @@ def shepp_logan(height: float, material: DeltaBeta, edge: float = 0.0) -> Contin
         lengths = half * np.array(semi)
         width = min(edge / float(lengths.mean()), 1.0)
         elements.append(
-            ellipsoid(upright @ (half * np.array(centre)), lengths, Soft(width), _times(material, level), turn)
+            ellipsoid(upright @ (half * np.array(centre)), lengths, Soft(width), scaled(material, level), turn)
         )
     return ContinuousScene(tuple(elements))
 
@@ -154,7 +154,7 @@ def coated_droplets(
     elements = []
     for ball in packed_balls(np.linspace(high, low, count), box, rng, margin=0.02 * low):
         radius, thick = 0.5 * ball.diameter, coating * rng.uniform(0.7, 1.3)
-        away = _direction(rng) * rng.uniform(0, 0.5) * thick
+        away = random_direction(rng) * rng.uniform(0, 0.5) * thick
         elements.append(ellipsoid(ball.centre, np.full(3, radius), Soft(0.0), shell))
         elements.append(ellipsoid(ball.centre + away, np.full(3, radius - thick), Soft(0.0), core.against(shell)))
     return ContinuousScene(tuple(elements))
@@ -172,7 +172,7 @@ def body_with_absorber(
     radius = 0.5 * in_range("bead", bead, 1e-9, float(semi.min()), unit="metres")
     require(beads >= 1, f"beads must be at least 1, but it is {beads}.")
     rng, least = np.random.default_rng(seed), float(semi.min())
-    elements = [ellipsoid(np.zeros(3), semi / 1.03, Soft(0.06), soft, gradient=0.15 / least * _direction(rng))]
+    elements = [ellipsoid(np.zeros(3), semi / 1.03, Soft(0.06), soft, gradient=0.15 / least * random_direction(rng))]
     sizes = np.concatenate([np.full(beads, 2 * radius / least), rng.uniform(0.15, 0.4, 10)])
     for i, ball in enumerate(packed_balls(sizes, (1.7, 1.7, 1.7), rng, margin=0.02, shape="ball")):
         if i < beads:
@@ -187,7 +187,7 @@ def _cell(
 ) -> list[Element]:
     """A graded cell in the ball of `radius`, its nucleus and its vacuoles."""
     level = rng.uniform(0.9, 1.1)
-    body = _body(rng, centre, radius, _times(material, level), edge, (0.8, 1.0), 0.15)
+    body = _body(rng, centre, radius, scaled(material, level), edge, (0.8, 1.0), 0.15)
     sizes = np.concatenate([[rng.uniform(0.75, 0.95)], rng.uniform(0.3, 0.45, rng.integers(2, 5))])
     parts = [body]
     for i, ball in enumerate(packed_balls(sizes, (1.65, 1.65, 1.65), rng, shape="ball")):
@@ -209,7 +209,7 @@ def _body(
     """An ellipsoid in the ball of `radius`, edge included, that rises by `slope` from its centre to one side."""
     semi = (radius - 0.5 * edge) * np.array([shares[1], *rng.uniform(*shares, 2)])
     width = edge / float(semi.max())
-    return ellipsoid(centre, semi, Soft(width), material, random_rotation(rng), slope / radius * _direction(rng))
+    return ellipsoid(centre, semi, Soft(width), material, random_rotation(rng), slope / radius * random_direction(rng))
 
 
 def _inside(
@@ -218,7 +218,7 @@ def _inside(
     """An ellipsoid at `place` [3] of `radius`, both in units of the body's semi-axes, of the body's matter × level."""
     semi = np.linalg.norm(body.axes, axis=1)
     centre = body.centre + place @ body.axes
-    return ellipsoid(centre, radius * semi, profile, _times(body.matter, level), (body.axes / semi[:, None]).T)
+    return ellipsoid(centre, radius * semi, profile, scaled(body.matter, level), (body.axes / semi[:, None]).T)
 
 
 def _grain(
@@ -232,17 +232,7 @@ def _grain(
     """A soft ellipsoid of the material × level in the ball of `radius`, with a nucleus or without."""
     semi = radius / 1.1 * np.array([1.0, *rng.uniform(0.7, 1.0, 2)])
     turn = random_rotation(rng)
-    parts = [ellipsoid(centre, semi, Soft(0.2), _times(material, level), turn)]
+    parts = [ellipsoid(centre, semi, Soft(0.2), scaled(material, level), turn)]
     if nucleus is not None:
-        parts.append(ellipsoid(centre, 0.5 * semi, Soft(0.5), _times(material, nucleus), turn))
+        parts.append(ellipsoid(centre, 0.5 * semi, Soft(0.5), scaled(material, nucleus), turn))
     return parts
-
-
-def _direction(rng: np.random.Generator) -> np.ndarray:
-    """A unit vector [3], all directions equally likely."""
-    found = rng.normal(size=3)
-    return found / np.linalg.norm(found)
-
-
-def _times(matter: DeltaBeta, factor: float) -> DeltaBeta:
-    return DeltaBeta(factor * matter.delta, factor * matter.beta)

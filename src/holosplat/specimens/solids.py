@@ -12,10 +12,22 @@ import numpy as np
 
 from ..checks import require
 from ..ranges import Many, ManyOrNone, Share, Small, SomeShare, ranged
-from .drawn import LONG, SHARE, Drawn, Substances, ball_meshes, meshed, region
+from .drawn import (
+    LONG,
+    SHARE,
+    Drawn,
+    Substances,
+    ball_meshes,
+    box_mesh,
+    column,
+    lathe,
+    meshed,
+    prism,
+    region,
+    rough_lens,
+)
 from .red_cells import random_cells
 from .rods import Rod, RodScene
-from .shapes import box_mesh, column, lathe, prism, rough_lens
 
 HURST = 0.8
 """Exponent of the roughness of fracture surfaces (Bouchaud 1997, J. Phys. Condens. Matter 9, 4319)."""

@@ -29,9 +29,8 @@ from ..scan import Exposures
 from .folder import Dataset
 from .options import TrainOptions, ViewSampling
 from .sample import Sample, SampleScan, as_scan
-from .shown import share_of_overlap
+from .shown import Validation, share_of_overlap
 from .train import BETAS, PURPOSE, Training
-from .validate import Validation
 
 FIT = AlignedFit()
 """The field lives where that of a reconstruction does."""

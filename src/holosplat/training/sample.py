@@ -10,10 +10,8 @@ from typing import Literal
 import numpy as np
 import torch
 
-from ..beamline.declared.case import Case, case_of
-from ..beamline.declared.declaration import Beam, Declaration, Detector, Listed, Matter, Substance
-from ..beamline.declared.soft_specimens import SoftCells
-from ..beamline.declared.specimens import Capsules, CrowdedCells, FoamDrop, RedCells, Specimen
+from ..beamline.declared.declaration import Beam, Case, Declaration, Detector, Listed, Matter, Substance, case_of
+from ..beamline.declared.specimens import Capsules, CrowdedCells, FoamDrop, RedCells, SoftCells, Specimen
 from ..beamline.light import UnevenLight
 from ..beamline.misalignment import Misalignment
 from ..checks import InputError

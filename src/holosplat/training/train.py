@@ -29,8 +29,7 @@ from .folder import Dataset
 from .options import TrainOptions
 from .ranges import Ranges
 from .sample import Sample
-from .shown import draw_example, loss
-from .validate import Validation
+from .shown import Validation, draw_example, loss
 
 PURPOSE = 2102
 """Keeps the numbers that are drawn here apart from others of the same seed."""

@@ -19,7 +19,7 @@ from ..motion.assimilate import carry_by_frames
 from ..motion.dynamics import DynamicsForecast, carry, window_of
 from ..motion.fit import MotionFit
 from ..motion.forecast import Forecast, Halves, PathForecast, extrapolate
-from ..motion.split_half_errors import LEAST, half_sets
+from ..motion.measures import LEAST, half_sets
 from ..optics.background import Light
 from ..progress import FitProgress
 from ..ranges import Many, Seconds, ranged

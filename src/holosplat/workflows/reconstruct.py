@@ -15,9 +15,9 @@ from ..backends import in_main_memory, resolve
 from ..checks import as_written, positive, require
 from ..fit.running import Record, Running
 from ..inference import Decision
-from ..io.guess import write_guess
 from ..io.json import write_json
 from ..io.light import read_still_light
+from ..io.volumes import write_guess
 from ..learning.start import GuessedMatter
 from ..matter import MaterialPrior, MatterKind
 from ..methods import Auto, Gaussians, Method, Settled, Stage, Task, begun, finished, learned, settled

@@ -9,8 +9,7 @@ import numpy as np
 
 from ..checks import as_written, require
 from ..fit.residuals import Prediction
-from ..io.atomic import write_rows
-from ..io.folder import atomic_folder
+from ..io.atomic import atomic_folder, write_rows
 from ..io.pvd import TimeStep, write_pvd
 from ..io.vtk import write_mesh
 from ..matter import KnownSeveral, MaterialPrior
@@ -18,8 +17,7 @@ from ..methods import Task
 from ..methods.assumed import assumed_material
 from ..methods.illumination import prepared
 from ..motion.elastic import Rest, strain_energy
-from ..motion.measures import columns, measured, row
-from ..motion.split_half_errors import standard_errors
+from ..motion.measures import columns, measured, row, standard_errors
 from ..motion.track import NOWHERE, USUAL, Followed, TrackOptions, follow, require_times
 from ..optics.background import LightOptions
 from ..progress import FitProgress

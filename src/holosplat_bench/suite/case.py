@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from holosplat.beamline.declared.case import Case, case_of
-from holosplat.beamline.declared.declaration import declared_names, read_declaration
+from holosplat.beamline.declared.declaration import Case, case_of, declared_names, read_declaration
 from holosplat.checks import InputError, require, whole_seed
 from holosplat.scan import Exposures
 

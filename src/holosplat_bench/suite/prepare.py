@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from holosplat.beamline.declared.case import Case
+from holosplat.beamline.declared.declaration import Case
 from holosplat.checks import require
 from holosplat.io.json import read_json, write_json
 from holosplat.io.nxtomo import read_scan, write_scan

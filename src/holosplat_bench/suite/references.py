@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from holosplat.baselines import TOMOGRAPHIES
-from holosplat.beamline.declared.case import Case
+from holosplat.beamline.declared.declaration import Case
 from holosplat.checks import require
 from holosplat.geometry import Grid
 from holosplat.matter import Matter

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from holosplat.align.held_out import place_frames
 from holosplat.align.poses import PoseOptions
 from holosplat.backends import resolve
-from holosplat.beamline.declared.case import Case
+from holosplat.beamline.declared.declaration import Case
 from holosplat.checks import InputError, require
 from holosplat.metrics import resolution
 from holosplat.optics.sampling import fringe_sampling

@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from holosplat.beamline.declared.case import Case
+from holosplat.beamline.declared.declaration import Case
 from holosplat.checks import InputError, at_least, require
 from holosplat.fit.density import DensityControl
 from holosplat.fit.schedule import Schedule

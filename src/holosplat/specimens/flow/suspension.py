@@ -12,8 +12,7 @@ from torch import Tensor
 from ...checks import InputError, in_range, require
 from ...ranges import Positive, ranged
 from ..membrane.model import Membrane
-from .channel import Channel
-from .contacts import Repulsion, contact_forces, wall_forces
+from .channel import Channel, Repulsion, contact_forces, wall_forces
 
 BLOB = 0.39
 """ε in square roots of a node's area, at which a ball of evenly spaced nodes drags as Stokes says (tests)."""

@@ -1,18 +1,43 @@
-"""The membrane of a cell: its rest shape and elastic moduli, its energies and forces."""
+"""The membrane of a cell: its rest shape and elastic moduli, its energies and forces.
+
+Elastic energies of a membrane [J], each a differentiable function of its nodes.
+The object-in-fluid model (Dupin et al. 2007, Phys. Rev. E 75, 066707; Cimrák, Gusenbauer & Schrefl 2012, Comput. Math.
+Appl. 64, 278; Cimrák, Gusenbauer & Jančigová 2014, Comput. Phys. Commun. 185, 900) is springs along edges, bending,
+local and global area, and volume; its forces were published; the energies here have these forces as gradients (areas:
+in the form that has an energy). Skalak et al. (1973, Biophys. J. 13, 245) is the continuum alternative to springs.
+Nodes are [..., P, 3] [m], energies [...].
+
+A cell stretched in optical tweezers: the test that every membrane model is put to.
+Two beads stick to opposite ends of the rim and are pulled apart (Dao, Lim & Suresh 2003, J. Mech. Phys. Solids 51,
+2259; Mills et al. 2004, Mech. Chem. Biosyst. 1, 169). The cell is so slow to be pulled that it is always at rest:
+at each force the shape is the one of least energy, found from the shape at the force before.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from scipy.optimize import minimize
 from torch import Tensor
 
+from ...checks import InputError, in_range, require
 from ...mesh import TriangleMesh
 from ...ranges import ranged
-from . import energies
-from .energies import deformation_gradient, neo_hookean, strain_invariants
-from .geometry import angle_between, area_vectors, corners_of, cross, enclosed_volume, triangle_areas
-from .rest import RestShape
+from .rest import (
+    RestShape,
+    angle_between,
+    area_vectors,
+    corners_of,
+    cross,
+    dihedral_angles,
+    edge_lengths,
+    enclosed_volume,
+    triangle_areas,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,19 +166,19 @@ class Membrane:
         of, rest = self.elasticity, self.rest
         found = {}
         if of.springs:
-            found["stretching"] = energies.stretching_energy(nodes, rest, of.springs)
+            found["stretching"] = stretching_energy(nodes, rest, of.springs)
         if of.linear_springs:
-            found["linear stretching"] = energies.linear_energy(nodes, rest, of.linear_springs)
+            found["linear stretching"] = linear_energy(nodes, rest, of.linear_springs)
         if of.skalak_shear:
-            found["skalak"] = energies.skalak_energy(nodes, rest, of.skalak_shear, of.skalak_dilation)
+            found["skalak"] = skalak_energy(nodes, rest, of.skalak_shear, of.skalak_dilation)
         if of.bending:
-            found["bending"] = energies.bending_energy(nodes, rest, of.bending)
+            found["bending"] = bending_energy(nodes, rest, of.bending)
         if of.local_area:
-            found["local area"] = energies.local_area_energy(nodes, rest, of.local_area)
+            found["local area"] = local_area_energy(nodes, rest, of.local_area)
         if of.global_area:
-            found["global area"] = energies.global_area_energy(nodes, rest, of.global_area)
+            found["global area"] = global_area_energy(nodes, rest, of.global_area)
         if of.volume:
-            found["volume"] = energies.volume_energy(nodes, rest, of.volume)
+            found["volume"] = volume_energy(nodes, rest, of.volume)
         return found
 
     def energy(self, nodes: Tensor) -> Tensor:
@@ -184,3 +209,161 @@ class Membrane:
     def volume(self, nodes: Tensor) -> Tensor:
         """Enclosed volume [...] [m³]."""
         return enclosed_volume(corners_of(nodes, self.rest.faces))
+
+
+ROOTS = tuple((math.cos(math.pi * k / 8), math.sin(math.pi * k / 8)) for k in (1, 3, 5, 7))
+"""Real and imaginary parts of the roots of u⁸ = -1 in the upper half plane."""
+
+
+def stretching_energy(nodes: Tensor, rest: RestShape, stiffness: float) -> Tensor:
+    """Springs along edges, stiffness k [N/m]: Σ k L₀² ∫₁^λ κ(s) (s - 1) ds, λ = L/L₀, κ from `neo_hookean`."""
+    ratio = edge_lengths(nodes, rest.edges) / rest.length
+    return stiffness * (rest.length**2 * (_spring(ratio) - _spring(torch.ones_like(rest.length)))).sum(-1)
+
+
+def linear_energy(nodes: Tensor, rest: RestShape, stiffness: float) -> Tensor:
+    """Springs that do not soften, Σ k/2 (L - L₀)² over edges; stiffness k [N/m]."""
+    return 0.5 * stiffness * ((edge_lengths(nodes, rest.edges) - rest.length) ** 2).sum(-1)
+
+
+def neo_hookean(ratio: Tensor) -> Tensor:
+    """κ(λ) = (λ^½ + λ^-2.5)/(λ + λ⁻³): springs soften as rubber does (Dupin 2007, eq. 19)."""
+    return (ratio**0.5 + ratio**-2.5) / (ratio + ratio**-3)
+
+
+def _spring(ratio: Tensor) -> Tensor:
+    """∫ κ(λ) (λ - 1) dλ: with u = √λ the integrand is 2 (u² - 1 + (u² - 1)²/(u⁸ + 1)) du, in partial fractions."""
+    u = ratio.sqrt()
+    total = 2 * (u**3 / 3 - u)
+    for real, imaginary in ROOTS:
+        root = complex(real, imaginary)
+        weight = -root * (root**2 - 1) ** 2 / 8  # the residue: 1/(8 r⁷) = -r/8
+        distance = 0.5 * torch.log((u - real) ** 2 + imaginary**2)
+        direction = torch.atan2(torch.full_like(u, imaginary), u - real)
+        total = total + 4 * (weight.real * distance + weight.imag * direction)
+    return total
+
+
+def bending_energy(nodes: Tensor, rest: RestShape, stiffness: float) -> Tensor:
+    """Σ over edges k/2 (θ - θ₀)², θ the angle between the triangles beside it; stiffness k [J].
+
+    On even triangles k = 2κ/√3 gives the bending rigidity κ (Seung & Nelson 1988, Phys. Rev. A 38, 1005).
+    """
+    turn = dihedral_angles(nodes, rest.edges, rest.opposite) - rest.angle
+    return 0.5 * stiffness * (turn**2).sum(-1)
+
+
+def local_area_energy(nodes: Tensor, rest: RestShape, modulus: float) -> Tensor:
+    """Σ over triangles k/2 (A - A₀)²/A₀; modulus k [N/m]."""
+    areas = triangle_areas(corners_of(nodes, rest.faces))
+    return 0.5 * modulus * ((areas - rest.area) ** 2 / rest.area).sum(-1)
+
+
+def global_area_energy(nodes: Tensor, rest: RestShape, modulus: float) -> Tensor:
+    """k/2 (S - S₀)²/S₀ of the whole surface S; modulus k [N/m]."""
+    surface = triangle_areas(corners_of(nodes, rest.faces)).sum(-1)
+    return 0.5 * modulus * (surface - rest.surface) ** 2 / rest.surface
+
+
+def volume_energy(nodes: Tensor, rest: RestShape, modulus: float) -> Tensor:
+    """k/2 (V - V₀)²/V₀; modulus k [N/m²]."""
+    volume = enclosed_volume(corners_of(nodes, rest.faces))
+    return 0.5 * modulus * (volume - rest.volume) ** 2 / rest.volume
+
+
+def skalak_energy(nodes: Tensor, rest: RestShape, shear: float, dilation: float) -> Tensor:
+    """∫ G/4 (I₁² + 2 I₁ - 2 I₂ + C I₂²) dA₀, I₁ = tr FᵀF - 2, I₂ = det FᵀF - 1 (Skalak 1973).
+
+    shear: modulus G [N/m]; dilation: the number C, the area modulus being G (1 + 2 C). F is constant on a triangle.
+    """
+    gradient = deformation_gradient(corners_of(nodes, rest.faces), rest)
+    first, second = strain_invariants(gradient)
+    density = 0.25 * shear * (first**2 + 2 * first - 2 * second + dilation * second**2)
+    return (rest.area * density).sum(-1)
+
+
+def deformation_gradient(corners: Tensor, rest: RestShape) -> Tensor:
+    """F [..., F, 3, 2] of triangles with `corners` [..., F, 3, 3] against their rest shape."""
+    a, b, c = corners.unbind(-2)
+    return torch.stack([b - a, c - a], dim=-1) @ rest.frame
+
+
+def strain_invariants(gradient: Tensor) -> tuple[Tensor, Tensor]:
+    """I₁ and I₂ [...] of deformation gradients [..., 3, 2]."""
+    along, across = gradient.unbind(-1)
+    xx, yy, xy = (along**2).sum(-1), (across**2).sum(-1), (along * across).sum(-1)
+    return xx + yy - 2, xx * yy - xy**2 - 1
+
+
+LENGTH, ENERGY = 1e-6, 1e-18
+"""Units of the search: µm and pN µm."""
+OPTIONS = {"maxiter": 20_000, "maxfun": 40_000, "maxcor": 30, "ftol": 0.0, "gtol": 1e-3}
+RESTARTS = 10
+RESIDUAL = 5e-15
+"""Greatest force left on a node of a cell at rest [N]; the loads are some pN a node."""
+
+
+@dataclass(frozen=True)
+class Stretched:
+    """A cell under one force: force [N]; axial and transverse: its extents along and across the pull [m], as seen
+    along its axis; area and volume: relative changes against rest; residual: greatest force left on a node [N]."""
+
+    force: float
+    axial: float
+    transverse: float
+    area: float
+    volume: float
+    residual: float
+    nodes: torch.Tensor
+
+
+def stretch(membrane: Membrane, forces: Sequence[float], patch: float = 0.05) -> list[Stretched]:
+    """`membrane`, a cell with its axis along z, pulled along ±x by each of `forces` [N] in turn, which must rise.
+
+    patch: the fraction of nodes at either end that share the force evenly. `InputError` where the search for the shape
+    at rest fails.
+    """
+    pulls = np.array([in_range("force", force, 1e-14, 1e-8, unit="newtons") for force in forces])
+    require(len(pulls) > 0 and bool(np.all(np.diff(pulls) > 0)), "forces must rise, at least one of them; sort them.")
+    in_range("patch", patch, 1e-3, 0.5)
+    nodes = torch.from_numpy(membrane.mesh.vertices.copy())
+    direction = _patches(nodes, patch)
+    found = []
+    for force in pulls:
+        nodes, residual = _at_rest(membrane, nodes, force * direction)
+        extent = (nodes.max(0).values - nodes.min(0).values).tolist()
+        area = float(membrane.surface(nodes) / membrane.rest.surface) - 1
+        volume = float(membrane.volume(nodes) / membrane.rest.volume) - 1
+        found.append(Stretched(float(force), extent[0], extent[1], area, volume, residual, nodes))
+    return found
+
+
+def _patches(nodes: torch.Tensor, fraction: float) -> torch.Tensor:
+    """[P, 3]: +x over the nodes at one end and -x at the other, each end's sum 1."""
+    count = max(1, round(fraction * len(nodes)))
+    order = torch.argsort(nodes[:, 0], stable=True)
+    direction = torch.zeros_like(nodes)
+    direction[order[-count:], 0] = 1 / count
+    direction[order[:count], 0] = -1 / count
+    return direction
+
+
+def _at_rest(membrane: Membrane, start: torch.Tensor, load: torch.Tensor) -> tuple[torch.Tensor, float]:
+    """Nodes of least energy under the dead load [P, 3] [N], by L-BFGS, and the greatest force left [N]."""
+
+    def potential(flat: np.ndarray) -> tuple[float, np.ndarray]:
+        nodes = LENGTH * torch.from_numpy(flat.reshape(-1, 3).copy())
+        energy = membrane.energy(nodes) - (load * (nodes - start)).sum()
+        pull = membrane.forces(nodes) + load
+        return float(energy) / ENERGY, -(pull.reshape(-1) * (LENGTH / ENERGY)).numpy()
+
+    point, residual = (start / LENGTH).reshape(-1).numpy(), np.inf
+    for _ in range(RESTARTS):  # where its line search is lost in rounding, the method starts anew from there
+        found = minimize(potential, point, jac=True, method="L-BFGS-B", options=OPTIONS)
+        point, residual = found.x, float(np.abs(found.jac).max()) * ENERGY / LENGTH
+        if residual <= RESIDUAL:
+            return LENGTH * torch.from_numpy(point.reshape(-1, 3)), residual
+    raise InputError(
+        f"the cell must come to rest under the load, but {1e12 * residual:.2g} pN are left on a node after "
+        f"{RESTARTS} searches; take smaller steps of force, or other moduli."
+    )

@@ -15,8 +15,7 @@ from scipy.optimize import minimize
 from ...checks import in_range, require
 from ...mesh import TriangleMesh
 from ..red_cells import DIAMETER, RedCell, half_thickness, icosphere
-from .geometry import corners_of, edge_lengths, triangle_areas
-from .rest import RestShape
+from .rest import RestShape, corners_of, edge_lengths, triangle_areas
 
 FREQUENCIES = (3, 20)
 """Least and greatest f: 92 to 4002 nodes."""
