@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from holosplat.baselines.material import estimate_delta
-from holosplat.baselines.tomography import level_of, plateau
+from holosplat.baselines.material import estimate_delta, level_of
+from holosplat.baselines.tomography import plateau
 from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
 from holosplat.geometry import Views

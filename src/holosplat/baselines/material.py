@@ -37,8 +37,8 @@ class MaterialEstimate:
     width: int = 64
     """Frames are binned to about so many pixels for δ/β, which acts on the lowest frequencies only; to twice as many
     for δ."""
-    weight: Weight = 0.1
-    """Weight of total variation in the trial volumes, in pixels of path length."""
+    weight: Weight = 0.3
+    """Weight of total variation in the trial volumes, in pixels of path length through the level found."""
     iterations: int = 40
     """Primal–dual steps for a trial volume."""
 
@@ -103,6 +103,20 @@ def estimate_delta(
     on_progress("estimate of delta", 0.0)
     coarse = scan.coarsened(max(1, round(scan.views.shape[1] / (2 * options.width))))
     return plateau(_trial_volume(coarse, ratio, backend, options, sign)) * sign * TRIAL_DELTA
+
+
+def level_of(occupancy: Tensor) -> float:
+    """The level [units of `occupancy`] of matter with one level beside a faint haze, both in [Z, Y, X] ≥ 0.
+
+    The `plateau` of the denser of the two classes whose means differ most for their numbers (Otsu 1979): of small
+    bodies in a large field, haze may have more mass.
+    """
+    values = occupancy.double().flatten().sort(descending=True).values
+    require(bool(values[0] > 0), "an empty volume has no level; look at its frames first.")
+    count = torch.arange(1, len(values), dtype=values.dtype, device=values.device)
+    upper = values.cumsum(0)[:-1]
+    between = (upper * len(values) - values.sum() * count).square() / (count * (len(values) - count))
+    return plateau(occupancy * (occupancy >= values[int(between.argmax())]))
 
 
 def _trial_volume(scan: Scan, ratio: float, backend: Backend, options: MaterialEstimate, sign: float) -> Tensor:

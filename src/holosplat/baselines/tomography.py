@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..checks import NoMatterError, require
+from ..checks import NoMatterError
 from ..geometry import Grid, Views
 from ..memory import memory_kept
 from ..metrics.correlation import shortest_side
@@ -113,8 +113,8 @@ def tv_solver(
     """The solver of `total_variation` after its last iteration, for those who go on from there.
 
     Where there is no upper bound, the unit of the occupancy says nothing of the matter: the weight of total variation
-    and the misfit's spectrum are then per `level_of` the volume, found anew after every `LEVEL_STEPS`; in the first of
-    them there is no total variation.
+    and the misfit's spectrum are then per level of the volume (its `plateau`), found anew after every `LEVEL_STEPS`; in
+    the first of them there is no total variation.
 
     weights: trust in each ray [V, H, W], above 0; with them, or with still light, frequencies are trusted alike to the
     end. Rays of missing pixels take the line integral of the volume, and so have no weight.
@@ -135,7 +135,7 @@ def tv_solver(
         on_progress(done / total)
         images = solver.completed(measured, gaps)
         if upper is None and done % LEVEL_STEPS == 0 and bool((solver.volume > 0).any()):
-            level = level_of(solver.volume)
+            level = plateau(solver.volume)
         if done == options.first and options.discount > 0 and not alike:
             spectrum = misfit_spectrum(rays, solver.lines() - images) / (level or 1.0) ** 2
             solver.discount(spectrum**options.discount)
@@ -180,20 +180,6 @@ def plateau(occupancy: Tensor) -> float:
         raise NoMatterError
     mass = values.double().cumsum(0)
     return float(values[int(torch.searchsorted(mass, 0.5 * mass[-1]))])
-
-
-def level_of(occupancy: Tensor) -> float:
-    """The level [units of `occupancy`] of matter with one level beside a faint haze, both in [Z, Y, X] ≥ 0.
-
-    The `plateau` of the denser of the two classes whose means differ most for their numbers (Otsu 1979): of small
-    bodies in a large field, haze may have more mass.
-    """
-    values = occupancy.double().flatten().sort(descending=True).values
-    require(bool(values[0] > 0), "an empty volume has no level; look at its frames first.")
-    count = torch.arange(1, len(values), dtype=values.dtype)
-    upper = values.cumsum(0)[:-1]
-    between = (upper * len(values) - values.sum() * count).square() / (count * (len(values) - count))
-    return plateau(occupancy * (occupancy >= values[int(between.argmax())]))
 
 
 TOMOGRAPHIES: dict[str, Tomography] = {

@@ -23,7 +23,6 @@ from .json import write_json
 from .png import LEVELS, PngKind, read_png, write_png
 from .raw_file import Loader, folder_with, require_said, stand_in
 from .seeds import hull_points, uniform_points
-from .splats import write_ply
 from .table import Table, beam_table, exposure_table, in_order, read_exposures
 
 FORMAT = "holosplat NeRF-synthetic 1"
@@ -111,6 +110,8 @@ def write_nerf_synthetic(
     a copy of the test's: most readers ask for one. Errors: `InputError` for views of several pixel sizes, since one
     angle of view serves all cameras.
     """
+    from .splats import write_ply  # needs torch, which takes longer than all else
+
     _ = scan.views.pixel_size
     views, train = scan.views, np.flatnonzero(~scan.is_test)
     low, high = grey_range(scan)

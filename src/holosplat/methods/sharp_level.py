@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..backends import Backend
-from ..baselines.material import DEFAULT, MaterialEstimate
-from ..baselines.tomography import level_of
+from ..baselines.material import DEFAULT, MaterialEstimate, level_of
 from ..matter import DeltaBeta, KnownRatio
 from .assumed import assumed_material
 from .method import Task
