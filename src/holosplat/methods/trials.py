@@ -185,8 +185,10 @@ def with_more(light: Light, hypothesis: str, seen: Scan, predict: Predict, optio
         if light.background is not None:
             return None  # it holds the flux
         even = light.evened(frames)
-        unknown = replace(light, background=Background.unknown_flux(even))
-        return replace(light, background=Background.of_flux(even, predict(unknown)))
+        unknown = Background.unknown_flux(even)
+        if unknown.size_of_doubt == 0:
+            return light  # the means differ no more than by noise
+        return replace(light, background=Background.of_flux(even, predict(replace(light, background=unknown))))
     frames, factor = frames if light.still is None else (frames / light.still).float(), coarse_binning(seen)
     smooth = replace(binned_options(options, seen.views.shape, factor), kind="smooth")
     try:
