@@ -38,9 +38,8 @@ def main(out: Path) -> None:
         result = hs.reconstruct(scan, prior, hs.preset("fast"))
         scores = hs.evaluate(result, scan, truth=truth)
         numbers, found = scores.headline(), scores.material
-        allowed = "".join(f" ({each.low:.0f} to {each.high:.0f} by the frames)" for each in result.constants)
         print(
-            f"{name}: found δ = {found.delta:.3e}, δ/β = {found.ratio:.0f}{allowed}; Dice {numbers['dice']:.3f}, "
+            f"{name}: found δ = {found.delta:.3e}, δ/β = {found.ratio:.0f}; Dice {numbers['dice']:.3f}, "
             f"error of δ {numbers['relative_error_delta']:.3f}, SSIM of held-out frames {numbers['ssim']:.3f}"
         )
         axis.imshow(result.object.voxelise(grid).delta.max(axis=0), cmap="magma", vmin=0, vmax=1.2 * material.delta)

@@ -37,7 +37,7 @@ class MaterialEstimate:
     width: int = 64
     """Frames are binned to about so many pixels for δ/β, which acts on the lowest frequencies only; to twice as many
     for δ."""
-    weight: Weight = 0.3
+    weight: Weight = 0.1
     """Weight of total variation in the trial volumes, in pixels of path length through the level found."""
     iterations: int = 40
     """Primal–dual steps for a trial volume."""

@@ -5,15 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
 
 from ..checks import InputError, finite, require
 from ..divided_light import DividedLight
-from ..optics.background import ORDER, Background
 from .hdf5 import Fields, open_hdf5
 from .hdf5_writing import new_hdf5, put
+
+if TYPE_CHECKING:
+    from ..optics.background import Background
 
 FORMAT = "holosplat light 1"
 
@@ -27,6 +30,8 @@ def write_light(
     """Coefficients [V, (K + 1)²] of `exp(Σ c m)`, m the products of cosines of 0 to K half waves of `smooth_modes`, and
     the light [H, W] that all frames have in common; None: there is none.
     marks: further attributes."""
+    from ..optics.background import ORDER  # needs torch, which takes longer than all else
+
     with new_hdf5(path) as file:
         file.attrs.update(marks, format=FORMAT)
         if light is not None:
