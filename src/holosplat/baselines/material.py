@@ -38,7 +38,7 @@ class MaterialEstimate:
     """Frames are binned to about so many pixels for δ/β, which acts on the lowest frequencies only; to twice as many
     for δ."""
     weight: Weight = 0.1
-    """Weight of total variation in the trial volumes, in pixels of path length through the level found."""
+    """Weight of total variation in the trial volumes, in pixels of path length."""
     iterations: int = 40
     """Primal–dual steps for a trial volume."""
 
@@ -124,6 +124,6 @@ def _trial_volume(scan: Scan, ratio: float, backend: Backend, options: MaterialE
     frames, delta, used = torch.from_numpy(scan.frames), sign * TRIAL_DELTA, resolve(backend)
     lines = paganin(frames, scan.exposures, delta, delta / ratio, missing=scan.gaps)
     rays = rays_of(lines, scan.views, Grid.of_views(scan.views), used, scan.gaps)
-    how = TotalVariation(weight=options.weight, first=options.iterations, iterations=0)
+    how = TotalVariation(weight=options.weight, first=options.iterations, iterations=0, per_level=False)
     with memory_kept():
         return tv_solver(rays, None, how, lambda fraction: None, used).volume.cpu()

@@ -70,7 +70,8 @@ class TotalVariation:
     the misfit's spectrum (0: not at all, 1: as for noise of that spectrum); still_light: half waves up to which light
     that is the same in all views is unknown, but for its mean (0: it is even); misfit: weight of total variation as a
     multiple of the misfit (rms) of the first iterations, where that is more; inside: distance from the axis within
-    which matter lies, in pixels (0: anywhere).
+    which matter lies, in pixels (0: anywhere); per_level: whether, without an upper bound, the weight is per level of
+    the matter that is found.
     """
 
     weight: Weight = 0.5
@@ -80,6 +81,7 @@ class TotalVariation:
     still_light: int = 0
     misfit: Weight = 0.0
     inside: Metres = 0.0
+    per_level: bool = True
 
 
 def total_variation(
@@ -130,11 +132,12 @@ def tv_solver(
         solver.with_still_light(smooth_modes(rays.views.shape, options.still_light, like.device)[1:])
     alike = weights is not None or options.still_light > 0
     images, total = rays.projector.lines_out(rays.measured), options.first + options.iterations
-    gaps, measured, rms, level = rays.gaps(), images, 0.0, 0.0 if upper is None else 1.0
+    found = upper is None and options.per_level
+    gaps, measured, rms, level = rays.gaps(), images, 0.0, 0.0 if found else 1.0
     for done in range(total):
         on_progress(done / total)
         images = solver.completed(measured, gaps)
-        if upper is None and done % LEVEL_STEPS == 0 and bool((solver.volume > 0).any()):
+        if found and done % LEVEL_STEPS == 0 and bool((solver.volume > 0).any()):
             level = plateau(solver.volume)
         if done == options.first and options.discount > 0 and not alike:
             spectrum = misfit_spectrum(rays, solver.lines() - images) / (level or 1.0) ** 2
