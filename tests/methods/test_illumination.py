@@ -166,6 +166,23 @@ def test_flux_is_unknown_before_there_is_a_volume():
     assert found.size_of_doubt == pytest.approx(float(flux.log().std()), rel=0.1)
 
 
+def test_flux_is_told_by_a_volume_to_which_it_is_unknown(sharp):
+    """And not by one that takes all frames for equally lit."""
+    flux = 1 + 0.02 * np.random.default_rng(4).normal(size=(VIEWS, 1, 1))
+    scan, asked = lit(sharp, flux), list[Light]()
+
+    def predict(light: Light) -> torch.Tensor:
+        asked.append(light)
+        return sharp.measured
+
+    found = with_more(plain_light(scan.measured, LightOptions()), FLUX, scan, predict, LightOptions())
+    assert [each.background is not None and each.background.is_flux for each in asked] == [True]
+    assert asked[0].doubt.power().amax() > 100 * asked[0].noise.power().amax()
+    assert found is not None
+    off = found.factor().numpy() / flux
+    assert float(off.std()) < 1e-3
+
+
 def test_flux_is_told_where_it_spoils_the_volume(sharp):
     """The volume of frames in even light predicts worse than no matter; that beside unknown flux predicts well."""
     flux = 1 + 0.02 * np.random.default_rng(4).normal(size=(VIEWS, 1, 1))
