@@ -324,8 +324,8 @@ class PriorOptions:
     delta_beta: Signed | str | None = None
     """Or: only the ratio δ/β of the one material is known, or a range LOW:HIGH of it (for `reconstruct`)."""
     contrast: Literal["auto", "above", "below", "both"] = "auto"
-    """Side of the medium's δ on which matter lies: above, below, or both, of continuous matter such as a shock; auto: by
-    the material, or the frames decide."""
+    """Side of the medium's δ on which matter lies: above, below, or both, of continuous matter such as a shock; auto:
+    by the material, or the frames decide."""
 
     def ranges(self) -> dict[str, tuple[float, float]]:
         """What is said as a range, by name."""
@@ -364,8 +364,8 @@ class PriorOptions:
         sign = 1 if self.contrast == "above" else -1
         require(
             not prior.materials or prior.sign == sign,
-            f"--contrast must be on the side of --material, but it is {self.contrast}, and the material's δ lies on the "
-            "other side of its medium's; leave --contrast.",
+            f"--contrast must be on the side of --material, but it is {self.contrast}, and the material's δ lies on "
+            "the other side of its medium's; leave --contrast.",
         )
         return prior.signed(sign)
 

@@ -87,8 +87,8 @@ class VolumeProblem:
     """½ χ² of the frames and the prior of a volume u [Z, Y, X] of one material's occupancy, on voxels of a pixel.
 
     The volume has the rows beyond the frames, too (`WhitenedFrames.field`).
-    level: what u is about in matter, the unit of the prior's slopes and values; lower: what u is at least; support [Z, Y, X] bool: where matter
-    may be (None: anywhere), beyond which u must begin at zero, and stays there.
+    level: what u is about in matter, the unit of the prior's slopes and values; lower: what u is at least; support
+    [Z, Y, X] bool: where matter may be (None: anywhere), beyond which u must begin at zero, and stays there.
     """
 
     def __init__(
@@ -201,8 +201,8 @@ class Descent:
     """Projected L-BFGS from `start` [Z, Y, X], an iteration at a time; the objective never rises.
 
     Voxels at the lower bound that the gradient would keep there are fixed, and the others take a step of L-BFGS among
-    themselves, cut off there (two-metric projection: Bertsekas 1982; Nocedal & Wright 2006, algorithm 7.4, for the step, with the
-    problem's preconditioner as first inverse).
+    themselves, cut off there (two-metric projection: Bertsekas 1982; Nocedal & Wright 2006, algorithm 7.4, for the
+    step, with the problem's preconditioner as first inverse).
 
     u: the volume; value: its objective; done: how many iterations; ended: whether none lowers the objective further;
     kept: whether steps that would leave nothing are shortened, for an empty volume is a trap: there the prior of
