@@ -218,7 +218,7 @@ class MaterialPrior:
         """The same knowledge of continuous matter on both sides of its medium. Errors: `InputError` for several
         materials."""
         raise InputError(
-            "matter on both sides of its medium must be of one --material or --delta-beta; give one of them."
+            "matter on both sides of its medium must be of one --material, but there are several; give one."
         )
 
     def with_ratio(self, ratio: float) -> MaterialPrior:

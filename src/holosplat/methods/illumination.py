@@ -148,8 +148,8 @@ def prepared(task: Task, method: Method | None = None, before: Prepared | None =
         shown = None if method is None or method.of_series or not made else shows_matter(first, options, first.taken)
         if isinstance(method, Auto) and shown is not None and shown.choice.endswith(WITHOUT):
             kinds = method.with_effort(EFFORT).kinds
-            kinds = {"continuous": kinds["continuous"]} if task.prior.two_sided else kinds
-            scored = by_fits(task, first, kinds)
+            alone: dict[MatterKind, Method] = {"continuous": kinds["continuous"]}
+            scored = by_fits(task, first, alone if task.prior.two_sided else kinds)
             first.taken, again = decided(first, options, told, tuple(open_to), scored)
             made = (*made, shown, *again)
         elif method is not None and first.taken != told and not method.of_series:

@@ -32,8 +32,8 @@ lowest frequencies; or it is what a volume lacks, which is flatter than matter. 
 
 @dataclass(frozen=True)
 class Estimate:
-    """phase: delay (of holes: advance) [V, H, W] in radians, not negative unless matter is two-sided, float64; support: [V, H, W] bool, where
-    there may be matter."""
+    """phase: delay (of holes: advance) [V, H, W] in radians, not negative unless matter is two-sided, float64; support:
+    [V, H, W] bool, where there may be matter."""
 
     phase: Tensor
     support: Tensor
