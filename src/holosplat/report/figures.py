@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,7 +11,6 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from ..geometry import Grid
-from ..metrics import robust_material_delta
 from ..units import length_unit, plain, wavenumber
 from ..volume import Volume
 from .content import DELTA, HeldOutViews, ProjectedMaps, Quantity, pixel_of
@@ -27,12 +24,10 @@ from .style import (
     TRUE_SURFACE,
     WIDTH,
     PanelGrid,
-    colour_bar,
     decimal_scale,
     from_dark,
     image_panel,
     letter,
-    new_figure,
     scale_bar,
     styled,
 )
@@ -88,30 +83,15 @@ def _deviation(truth: Volume, level: float) -> Deviation:
     return Deviation(truth.delta, level, max(truth.grid.voxel_size), lambda d: colours(0.5 + 0.5 * d)[:, :3])
 
 
-def _surface_panel(axes: Axes, shown: SurfaceImage, grid: Grid, close: bool = False) -> None:
-    """The picture in its box; `close`: without the box, and no wider than the matter needs."""
+def _surface_panel(axes: Axes, shown: SurfaceImage, grid: Grid) -> None:
+    """The picture in its box."""
     half = 0.5 * shown.width
     axes.imshow(shown.rgba, extent=(-half, half, half, -half), zorder=2, interpolation="antialiased", aspect="auto")
     axes.set_axis_off()
-    if close:
-        _come_close(axes, shown)
-    else:
-        for points in box_edges(grid, shown.rotation):
-            axes.plot(points[:, 0], points[:, 1], lw=0.5, color=INK, alpha=0.4, zorder=1)
-        axes.set(xlim=(-half, half), ylim=(1.24 * half, -half))  # room for the scale bar below the box
-    left, right = axes.get_xlim()
-    scale_bar(axes, right - left, INK, 0.03)
-
-
-def _come_close(axes: Axes, shown: SurfaceImage) -> None:
-    rows, columns = np.nonzero(shown.rgba[..., 3])
-    if not rows.size:
-        return
-    box = axes.get_window_extent()
-    ratio = box.width / box.height
-    x, y = (0.5 * (i.min() + i.max() + 1) * shown.pixel_size - 0.5 * shown.width for i in (columns, rows))
-    half = 0.53 * max(np.ptp(columns) / ratio, np.ptp(rows)) * shown.pixel_size
-    axes.set(xlim=(x - half * ratio, x + half * ratio), ylim=(y + half, y - half))
+    for points in box_edges(grid, shown.rotation):
+        axes.plot(points[:, 0], points[:, 1], lw=0.5, color=INK, alpha=0.4, zorder=1)
+    axes.set(xlim=(-half, half), ylim=(1.24 * half, -half))  # room for the scale bar below the box
+    scale_bar(axes, 2 * half, INK, 0.03)
 
 
 @styled
@@ -297,56 +277,3 @@ def slice_titles(axes: list[Axes], first: int, name: str, grid: Grid, positions:
         where = centres[axis][positions[axis]] * factor
         fixed = "zyx"[axis]
         letter(panel, first + i, f"{name}, {plane} at {fixed} = {plain(where, 4)} {unit}".replace("-", "−"))
-
-
-@styled
-def hero_figure(
-    hologram: np.ndarray,
-    pixel_size: float,
-    reconstruction: Volume,
-    truth: Volume | None = None,
-    material: float | None = None,
-) -> Figure:
-    """The banner, 1600 × 500 pixels: a hologram [H, W] of `pixel_size` [m], the surface, and slices of δ.
-
-    material: the material's δ, whose half is the surface; None: its robust value. The slices are the xy and
-    xz planes that hold most matter: the truth above, the reconstruction below.
-    """
-    figure, grid = new_figure(10.0, 3.125, "none"), reconstruction.grid
-    material = robust_material_delta(truth or reconstruction) if material is None else material
-
-    def place(left: float, bottom: float, width: float, height: float) -> Axes:  # [inches]
-        return figure.add_axes((left / 10.0, bottom / 3.125, width / 10.0, height / 3.125))
-
-    first, second = place(0.05, 0.05, 2.8, 2.8), place(2.95, 0.05, 3.5, 2.8)
-    low, high = np.percentile(hologram, [0.2, 99.8])
-    image_panel(first, hologram, (pixel_size, pixel_size), HOLOGRAM_MAP, (float(low), float(high)))
-    scale_bar(first, hologram.shape[1] * pixel_size)
-    letter(first, 0, "Hologram")
-    picture = render_surface(reconstruction.delta, grid, 0.5 * material, camera(), 800, to_rgb(RECONSTRUCTION))
-    _surface_panel(second, picture, grid, close=True)
-    letter(second, 1, "Reconstruction")
-    drawn = _banner_slices(place, reconstruction, truth, material)
-    _, power = decimal_scale(material)
-    colour_bar(figure, drawn, place(9.47, 0.12, 0.085, 2.66), f"δ ({power})" if power else "δ")
-    return figure
-
-
-def _banner_slices(
-    place: Callable[[float, float, float, float], Axes],
-    reconstruction: Volume,
-    truth: Volume | None,
-    material: float,
-) -> AxesImage:
-    grid, planes = reconstruction.grid, richest_planes(truth or reconstruction)
-    scale, _ = decimal_scale(material)
-    limits = value_limits([v.delta / scale for v in (reconstruction, truth) if v is not None])
-    if truth is None:
-        panels = [place(6.6, 0.05, 2.8, 2.8)]
-        letter(panels[0], 2, "Slice of δ")
-        return slice_row(panels, reconstruction.delta / scale, grid, planes, from_dark(DELTA_MAP, limits), limits)
-    for i, (name, volume) in enumerate((("truth", truth), ("reconstruction", reconstruction))):
-        panels = [place(left, 1.56 - 1.51 * i, 1.29, 1.29) for left in (6.72, 8.11)]
-        drawn = slice_row(panels, volume.delta / scale, grid, planes, from_dark(DELTA_MAP, limits), limits)
-        letter(panels[0], 2 + i, f"Slices of δ, {name}")
-    return drawn
