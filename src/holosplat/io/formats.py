@@ -11,7 +11,7 @@ from typing import Any, Literal
 from ..checks import InputError, require
 from ..frames import Frames
 from ..scan import Scan
-from . import arrays, euxfel, exchange, images, nerf_synthetic, nxtomo, r2_gaussian, run_scan, tiff
+from . import arrays, euxfel, images, nerf_synthetic, nxtomo, r2_gaussian, run_scan, tiff
 from .raw_file import Loader, ScanFile
 from .reading import Reading
 from .stored_frames import Mended, with_fields
@@ -21,7 +21,7 @@ ScanFormat = Literal["nxtomo", "nerf-synthetic", "tiff", "r2-gaussian"]
 
 LOADERS: tuple[Loader, ...] = (
     nxtomo.LOADER,
-    exchange.LOADER,
+    arrays.EXCHANGE,
     arrays.LOADER,
     tiff.LOADER,
     images.LOADER,
@@ -108,6 +108,7 @@ def loader_of(path: str | Path) -> Loader:
     found = Path(path)
     require(found.exists(), f"{path} must be a scan, but there is no such file or folder; check the path.")
     loaders = [loader for loader in LOADERS if loader.recognises(found)]
+    loaders = [loader for loader in loaders if not loader.is_general] or loaders
     if len(loaders) == 1:
         return loaders[0]
     if loaders:

@@ -15,17 +15,13 @@ from typing import Any
 import numpy as np
 
 from ..checks import InputError, note, require
-from ..scan import Exposures
 from .angles import angles_of, read_angles, tell_angles
 from .file_order import in_order
 from .leftovers import is_hidden
 from .light_frames import light_frames
-from .nerf_synthetic import LOADER as NERF
-from .r2_gaussian import LOADER as R2
-from .raw_file import DARK, FLAT, NOTHING, PROJECTION, RAW_TAKES, Loader, ScanFile, exposures_of, together
+from .raw_file import DARK, FLAT, NOTHING, PROJECTION, RAW_TAKES, Loader, ScanFile
 from .stacks import IMAGES, ImageStack, images_in, stack_of
 from .stored_frames import reader
-from .tiff import LOADER as TIFF
 
 FIELDS = {FLAT: "flat|white|open_?beam|bright|refs?(?![a-z])|refhst", DARK: "dark"}
 """How the names of flats and of darks, and of their folders, begin, or a word in them."""
@@ -53,13 +49,10 @@ def open_images(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Iterato
     """
     source = Path(path)
     parts = [(PROJECTION, stack_of(source))] if source.is_file() else _in_folder(source, given.get("files"))
-    stacks, kinds = together(str(path), [*parts, *_greys(source, parts, given)])
-    projections = kinds == PROJECTION
     found = {} if source.is_file() or given.get("angles_deg") is not None else _angles(source)
-    exposures = exposures_of(str(path), given, found, stacks[0].shape[1:], projections)  # type: ignore[arg-type]
-    _tell_order(source, stacks, kinds, exposures)
-    nothing_held_out = np.zeros(int(projections.sum()), dtype=bool)
-    yield ScanFile(source, str(path), stacks, kinds, exposures, nothing_held_out, kinds_label=str(path))
+    file = ScanFile.of(source, [*parts, *_greys(source, parts, given)], given, found)
+    _tell_order(file)
+    yield file
 
 
 def _greys(path: Path, parts: list[tuple[int, Any]], given: Mapping[str, Any]) -> list[tuple[int, Any]]:
@@ -192,19 +185,17 @@ def _angles(folder: Path) -> dict[str, Any]:
     return {"angles_deg": angles}
 
 
-def _tell_order(source: Path, stacks: tuple[Any, ...], kinds: np.ndarray, exposures: Exposures) -> None:
+def _tell_order(found: ScanFile) -> None:
     """Say which files are the first and the last projection, with their angles, and count the flats and darks."""
-    first, angles = stacks[0], angles_of(exposures.views)
+    first, angles = found.stacks[0], angles_of(found.exposures.views)
     if not isinstance(first, ImageStack) or angles is None or len(angles) < 2:
         return
     ends = ", ".join(f"{which} {first.name(n)} at {angles[n]:.6g}°" for which, n in (("first", 0), ("last", -1)))
-    counts = [f", {count} {name}" for kind, name in KINDS.items() if (count := int((kinds == kind).sum()))]
-    note(f"{source}: {len(angles)} projections ({ends}){''.join(counts)}")
+    counts = [f", {count} {name}" for kind, name in KINDS.items() if (count := len(found.numbers(kind)))]
+    note(f"{found.path}: {len(angles)} projections ({ends}){''.join(counts)}")
 
 
 def _recognises(path: Path) -> bool:
-    if any(loader.recognises(path) for loader in (TIFF, NERF, R2)):
-        return False
     if path.is_file():
         return path.suffix.lower() in (*IMAGES, ".npy")
     folders = any(PROJECTIONS.match(one.name) or _kind(one) for one in _folders(path))
@@ -212,11 +203,6 @@ def _recognises(path: Path) -> bool:
 
 
 LOADER = Loader(
-    *(
-        "images",
-        f"images ({', '.join(IMAGES)}), one file or a folder of them, or an array (.npy)",
-        _recognises,
-        reader(open_images),
-    ),
-    *((*RAW_TAKES, "files", "black", "white"), open_images),
+    *("images", f"images ({', '.join(IMAGES)}), one file or a folder of them, or an array (.npy)", _recognises),
+    *(reader(open_images), (*RAW_TAKES, "files", "black", "white"), open_images, True),
 )
