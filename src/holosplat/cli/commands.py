@@ -168,7 +168,7 @@ def _scored(
     folder: RunFolder, result: Reconstruction, measured: Scan, scan: Path, reading: Reading
 ) -> tuple[Evaluation, Path]:
     """The scores of a run on its frames, and its report; the folder then knows where its frames are."""
-    from ..io.run_scan import run_source
+    from ..io.formats import run_source
     from ..report.run import report_run
     from ..workflows.evaluate import evaluate as score
     from ..workflows.reconstruction import instants_of

@@ -12,9 +12,8 @@ from tyro.conf import Positional, arg
 
 from ..checks import InputError, require
 from ..io.formats import ScanFormat, loader_of, read_as
-from ..io.nerf_synthetic import NerfOptions, grey_range, write_nerf_synthetic
+from ..io.nerf_synthetic import NerfOptions, PngKind, grey_range, write_nerf_synthetic
 from ..io.nxtomo import write_scan
-from ..io.png import PngKind
 from ..io.r2_gaussian import R2Options, write_r2_gaussian
 from ..io.reading import Reading
 from ..io.tiff import TiffLayout, write_tiff

@@ -163,8 +163,7 @@ def _export_series(path: Path, steps: Sequence[tuple[float, Path]], grid: Grid |
 
 def _export_compact(folder: RunFolder, out: Path, step_px: float, together: tuple[Path, ...]) -> None:
     from ..io.compact import steps_of
-    from ..io.objects import write_compact
-    from ..io.series import names_of, write_series
+    from ..io.objects import names_of, write_compact, write_series
     from ..workflows.reconstruct import load_reconstruction
     from ..workflows.run_folder import RunFolder
 

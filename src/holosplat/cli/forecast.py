@@ -11,9 +11,8 @@ import numpy as np
 from tyro.conf import Positional
 
 from ..checks import positive, require
-from ..io.formats import read_frames
+from ..io.formats import read_frames, run_reading, run_source
 from ..io.reading import Reading, Told, ends_of
-from ..io.run_scan import run_reading, run_source
 from ..motion.cell_model import ChannelFrame
 from ..motion.dynamics import DynamicsForecast
 from ..motion.fit import MotionFit

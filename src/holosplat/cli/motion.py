@@ -8,9 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..io.formats import read_frames
+from ..io.formats import read_frames, run_source
 from ..io.reading import Reading
-from ..io.run_scan import run_source
 from ..matter import KnownSeveral, MaterialPrior, MatterKind
 from ..methods import Auto, Method
 from ..motion.flow_reconstruction import FlowOptions

@@ -10,9 +10,8 @@ from tyro.conf import Positional
 
 from ..bodies.rest_shape import KnownBody
 from ..checks import positive, require
-from ..io.formats import read_frames
+from ..io.formats import read_frames, run_source
 from ..io.reading import Reading
-from ..io.run_scan import run_source
 from ..motion.known import beam_directions
 from ..motion.track import TrackOptions
 from ..planning.acts import of_track

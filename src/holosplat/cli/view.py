@@ -80,8 +80,7 @@ def _objects(what: Path) -> tuple[dict[str, Stored], list[str]]:
     """What the slider of time leads through, by its label, and words on the run."""
     from ..io.compact import SERIES
     from ..io.hdf5 import open_hdf5
-    from ..io.objects import read_object
-    from ..io.series import read_series
+    from ..io.objects import read_object, read_series
     from ..show.parts import at_times
     from ..show.scene import steps_of
     from ..workflows.reconstruction import instants_of

@@ -1,20 +1,84 @@
-"""Scans of every format that the project knows: `read` recognises the format by the content of a path."""
+"""Scans of every format that the project knows: `read` recognises the format by the content of a path.
+
+A run folder is one of them: its scan is that which `source.json` names, read as the run read it.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
 from ..checks import InputError, require
 from ..frames import Frames
 from ..scan import Scan
-from . import arrays, euxfel, images, nerf_synthetic, nxtomo, r2_gaussian, run_scan, tiff
-from .raw_file import Loader, ScanFile
+from . import arrays, euxfel, images, nerf_synthetic, nxtomo, r2_gaussian, tiff
+from .hdf5 import open_hdf5
+from .hdf5_guard import is_vouched
+from .raw_file import Loader, ScanFile, folder_with
 from .reading import Reading
 from .stored_frames import Mended, with_fields
+from .table import Table
+
+SOURCE, SUMMARY = "source.json", "summary.json"
+
+
+def run_reading(path: str | Path) -> Reading:
+    """How the run folder `path` read its scan; `InputError` for a source.json that is damaged.
+
+    Whether the scan may bring values of other files, the folder does not decide: it is as whoever reads it allows
+    (`Told.vouch`).
+    """
+    table = Table.read(Path(path) / SOURCE)
+    time_frame = table.values.get("time_frame")
+    known = time_frame is None or time_frame in ("all", "still") or isinstance(time_frame, int)
+    require(known, f"{table.label('time_frame')} must be a number, 'all' or null, but it is {time_frame!r}.")
+    said = Reading.from_table(table.values.get("reading", {}), f"{table.label('reading')}")
+    told = replace(said.told, allow_external=is_vouched(Path(path)))
+    return Reading(told, replace(said.part, time_frame=time_frame))
+
+
+def run_source(scan: Path, reading: Reading) -> dict[str, object]:
+    """What source.json says of a run of `scan`, read in a certain way."""
+    return {"scan": str(scan.resolve()), "time_frame": reading.part.time_frame, "reading": reading.as_table()}
+
+
+def read_run_scan(path: str | Path) -> Scan:
+    """The scan of the run folder `path`, read as the run read it: its frames of the time that the run is of, too.
+
+    Where the run refined the geometry, its frames are where it found them. Errors: `InputError` when the scan is no
+    longer there or cannot be read.
+    """
+    table = Table.read(Path(path) / SOURCE)
+    scan = Path(table.text("scan"))
+    there = scan.exists() and scan.resolve() != Path(path).resolve()
+    require(there, f"{table.label('scan')} must name the run's scan, but {scan} is not there or none; name another.")
+    return _where_found(Path(path) / SUMMARY, read_as(scan, run_reading(path)))
+
+
+def _where_found(summary: Path, scan: Scan) -> Scan:
+    """`scan` with the exposures that `summary` has, if the run found any; errors: `InputError` for other frames."""
+    found = Table.read(summary).values.get("geometry") if summary.is_file() else None
+    if found is None:
+        return scan
+    table, n = Table(summary, found, "geometry."), len(scan)
+    rotations, shifts = table.numbers("rotations", (n, 3, 3)), table.numbers("shifts", (n, 2))
+    planned = scan.exposures
+    old = "pixel_sizes" not in found
+    sizes = planned.views.pixel_sizes if old else table.numbers("pixel_sizes", (n,))
+    views = replace(planned.views, rotations=rotations, shifts=shifts, scales=sizes / planned.views.pitch)
+    exposures = replace(planned, views=views, distance=table.numbers("distance", (n,)))
+    return scan.taken(exposures)
+
+
+def read_marks(path: Path, names: Sequence[str]) -> dict[str, str]:
+    """Those of the attributes `names` that the file has at its top. Errors: `InputError`."""
+    with open_hdf5(path) as file:
+        return {name: str(file.attrs[name]) for name in names if name in file.attrs}
+
 
 ScanFormat = Literal["nxtomo", "nerf-synthetic", "tiff", "r2-gaussian"]
 """Formats that scans are written in."""
@@ -28,7 +92,10 @@ LOADERS: tuple[Loader, ...] = (
     euxfel.LOADER,
     nerf_synthetic.LOADER,
     r2_gaussian.LOADER,
-    run_scan.loader(lambda path, reading: read_as(path, reading)),
+    Loader(
+        *("run", f"a run folder, with config.json and {SOURCE}", folder_with("config.json", SOURCE)),
+        lambda path, given: read_run_scan(path),
+    ),
 )
 """Every format that scans are read from; a new one is a file and a line here (docs/adding.md)."""
 

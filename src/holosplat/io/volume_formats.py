@@ -16,11 +16,9 @@ from ..progress import Advance
 from ..ranges import Small, ranged
 from ..volume import Object, Volume
 from .file_order import in_order
-from .mrc import read_mrc, write_mrc
-from .nrrd import read_nrrd, write_nrrd
 from .ome_tiff import TIFF_SUFFIXES, read_ome_tiff, write_ome_tiff
 from .ome_zarr import ZARR_SUFFIX, read_ome_zarr, require_zarr, write_ome_zarr
-from .plain_values import both
+from .plain_values import both, read_mrc, read_nrrd, write_mrc, write_nrrd
 from .stacks import all_images
 from .volumes import REFRACTION, VOXEL_RANGE_M, Contents, Stored, read_stored, write_voxels
 from .vti import read_vti, write_vti
