@@ -24,9 +24,9 @@ from ..ranges import checked_later
 from ..version import __version__
 from .help import ALL, CONFIG, HELP, acts_of, overview, page, parser_of
 from .places import with_checked_arguments
-from .progress import INTERRUPTED, end_as_on_interrupt, logged, say_notes
+from .progress import end_as_on_interrupt, logged, say_notes
 from .resume import resumed
-from .sentence import give_up
+from .sentence import INTERRUPTED, give_up, say
 
 LONGEST = 200
 """Characters of another program's message, at most."""
@@ -48,7 +48,7 @@ GROUPS: dict[str, dict[str, str]] = {
     "Reconstruct": {
         "init": "pipeline",
         "run": "pipeline",
-        "calibrate": "calibrate",
+        "calibrate": "align",
         "align": "align",
         "retrieve": "retrieve",
         "reconstruct": "commands",
@@ -57,8 +57,8 @@ GROUPS: dict[str, dict[str, str]] = {
     },
     "Look": {"evaluate": "commands", "view": "view", "export": "export", "render": "commands", "compare": "compare"},
     "Series": {"series": "series", "watch": "watch", "forecast": "forecast"},
-    "Learn": {"dataset": "dataset", "train": "train"},
-    "Benchmark and installation": {"demo": "commands", "doctor": "doctor", "backends": "commands"},
+    "Learn": {"dataset": "learn", "train": "learn"},
+    "Benchmark and installation": {"demo": "commands", "doctor": "data", "backends": "commands"},
 }
 """Heading of the overview → its commands, each with the module that has a function of its name; what other packages add
 stands first under the last."""
@@ -126,7 +126,7 @@ def _carry_out(log: ExitStack) -> None:
     except UnicodeError as error:
         give_up(f"a name or text is none in UTF-8: {error}; correct it.")
     except KeyboardInterrupt:
-        print("holosplat: interrupted", file=sys.stderr)
+        say("holosplat: interrupted")
         raise SystemExit(INTERRUPTED) from None
     except BrokenPipeError:  # the reader, such as `head`, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

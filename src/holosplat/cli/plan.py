@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,6 +15,7 @@ from ..ranges import Frequency, Grams, Many, Metres, Natural, Photons, Pixels, P
 from .options import MaterialOptions
 from .places import Output
 from .progress import ProgressBar
+from .sentence import say
 
 if TYPE_CHECKING:
     from ..mesh import TriangleMesh
@@ -233,7 +233,7 @@ def plan(
             print("", *survey_lines(surveyed), sep="\n")
     if surveyed is not None and ranges.out is not None:
         _write(ranges.out, surveyed)
-        print(f"wrote {ranges.out} and {ranges.out.with_suffix('.csv')}", file=sys.stderr)
+        say(f"wrote {ranges.out} and {ranges.out.with_suffix('.csv')}")
 
 
 def _as_dict(name: str, setup: Setup, recording: Recording, planned: Plan, surveyed: Survey | None) -> dict[str, Any]:

@@ -24,8 +24,6 @@ from .places import Place, require_apart
 if TYPE_CHECKING:
     from tqdm import tqdm
 
-INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it."""
 TOLD = 0.03
 """Share of what was left at first that must be done before the time left is said."""
 STEP, SHORTEST_S, LONGEST_S = 0.05, 2.0, 60.0

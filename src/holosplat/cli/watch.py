@@ -15,8 +15,7 @@ from ..tables import to_table
 from .light import RunLightFlags
 from .options import MethodOptions, PriorOptions
 from .places import Kept
-from .progress import INTERRUPTED
-from .sentence import say
+from .sentence import interruptible, say
 from .series import Act, EachTime
 
 HOW, EACH, LIGHT = Watching(), EachTime(), RunLightFlags()
@@ -56,9 +55,6 @@ def watch(
     }
     result = WatchFolder(out)
     say(f"watching {folder}; the page is {result.page}; Ctrl-C ends")
-    try:
+    with interruptible(lambda: f"ended; what {out} holds is whole, and the same command goes on from there"):
         count = Watch(folder, result, settings, matter.prior, reading, how, say).run(said)
-    except KeyboardInterrupt:
-        say(f"ended; what {out} holds is whole, and the same command goes on from there")
-        raise SystemExit(INTERRUPTED) from None
     say(f"ended after {count} scan(s)")

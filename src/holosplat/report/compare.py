@@ -207,10 +207,10 @@ def compare(first: RunFolder, second: RunFolder, scan: Scan | None = None) -> Co
         >>> comparison.scores.dice > 0.8
         True
     """
-    return Comparison(*(_side_of(folder, scan) for folder in (first, second)))
+    return Comparison(*(side_of(folder, scan) for folder in (first, second)))
 
 
-def _side_of(folder: RunFolder, scan: Scan | None) -> Side:
+def side_of(folder: RunFolder, scan: Scan | None) -> Side:
     """A run, at its first time, with its scores on `scan`."""
     folder.require_run()
     result, times = load_reconstruction(folder), instants_of(folder)

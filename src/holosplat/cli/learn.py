@@ -1,17 +1,19 @@
-"""`holosplat dataset`: simulated scenes for learning, in a folder."""
+"""`holosplat dataset | train`: simulated scenes in a folder, and from these to the weights of a network."""
 
 from __future__ import annotations
 
-import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from tyro.conf import OmitArgPrefixes, arg
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from ..ranges import Jobs, Seed, Within
+from ..training.options import TrainOptions
 from ..training.ranges import Ranges
-from .places import Kept
-from .progress import INTERRUPTED, ProgressBar
+from .places import Kept, Output
+from .progress import ProgressBar
 from .room import tell
+from .sentence import interruptible
 
 if TYPE_CHECKING:
     from ..planning.needs import Needs
@@ -49,11 +51,8 @@ def dataset(
     fewer = ((f"--jobs {n}", _needs(drawn, left, n)) for n in range(jobs - 1, 0, -1))
     tell("the dataset", _needs(drawn, left, jobs), out, fewer)
     with ProgressBar() as bar:
-        try:
+        with interruptible(lambda: f"interrupted; {out} keeps its whole files, and the same command goes on"):
             made = make_dataset(wanted, jobs, lambda fraction: bar.show("scenes", fraction, {}))
-        except KeyboardInterrupt:
-            print(f"interrupted; {out} keeps its whole files, and the same command goes on", file=sys.stderr)
-            raise SystemExit(INTERRUPTED) from None
         done = [
             export(wanted, layout, lambda part, layout=layout: bar.show(f"{layout} files", part, {}))
             for layout in layouts
@@ -73,3 +72,47 @@ def _needs(drawn: Ranges, scenes: int, jobs: int) -> Needs:
     views = drawn.views + drawn.held_out
     ends = (of_simulation(each, Simulation().samples(each), views) for each in drawn.extremes())
     return of_dataset(max(ends, key=lambda needs: needs.memory), (drawn.rows, drawn.columns), views, scenes, jobs)
+
+
+DEFAULT = TrainOptions()
+"""More steps than the weights of the package were made with: their card says how many."""
+
+
+def train(
+    data: Positional[Path], out: Output, how: Annotated[TrainOptions, OmitArgPrefixes] = DEFAULT, resume: bool = False
+) -> None:
+    """Train a network on scenes of `holosplat dataset`: weights with a card, and curves.
+
+    That of `--start learned`, or, by --network, those of the methods onix and pixelnerf, which see frames alone.
+
+    Args:
+        data: Folder of scenes.
+        out: Folder to make.
+        resume: Go on with an interrupted training; --resume FOLDER alone, with its scenes and options.
+    """
+    from ..planning.acts import of_training
+    from ..report.curves import training_curves
+    from ..training.aligned import AlignedTraining, AlignedValidation
+    from ..training.folder import Dataset
+    from ..training.shown import Validation
+    from ..training.train import Training, made_by
+
+    scenes = Dataset.read(data)
+    scenes.require_whole()
+    frames, views = (scenes.ranges.rows, scenes.ranges.columns), max(how.shown.views)
+    views = min(views, scenes.ranges.views)
+    tell("the training", of_training(frames, views, how.network, how.size, how.steps), out)
+    kind = Training if how.network == "start" else AlignedTraining
+    training = (kind.resumed if resume else kind.begun)(scenes, out, how)
+    who = made_by(how.device)  # before files change under hours of work
+    with ProgressBar() as bar:
+        told = Validation.of(
+            scenes.ranges, scenes.seed, how.validation, lambda fraction: bar.show("scenes to validate", fraction, {})
+        )
+        if how.network != "start":
+            told = AlignedValidation(told.samples, network=how.network)
+        with interruptible(lambda: f"interrupted; {out} keeps the last checkpoint, go on with --resume"):
+            training.run(told, lambda now: bar.show("training", now.step / how.steps, now.record))
+    weights = training.finish(told, who)
+    print(f"Dice of scenes of another seed: {told.last()}")
+    print(f"wrote {weights} and {training_curves(out)}")
