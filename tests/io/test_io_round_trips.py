@@ -16,6 +16,7 @@ from hypothesis.extra.numpy import arrays
 
 from helpers.strategies import NAMES, VIEWS, clouds, images, numbers, scans, vectors
 from holosplat.geometry import Grid, Views
+from holosplat.io.images import read_tiff, write_tiff
 from holosplat.io.json import read_json, write_json
 from holosplat.io.nerf_synthetic import (
     LEVELS,
@@ -29,7 +30,6 @@ from holosplat.io.nerf_synthetic import (
 from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.io.objects import read_object, write_object
 from holosplat.io.r2_gaussian import R2Options, read_r2_gaussian, write_r2_gaussian
-from holosplat.io.tiff import read_tiff, write_tiff
 from holosplat.io.volumes import read_volume, write_volume
 from holosplat.io.vtk import read_meshes, write_mesh
 from holosplat.matter import Matter

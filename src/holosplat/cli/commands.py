@@ -297,7 +297,7 @@ def evaluate(
         truth: Volume file of the truth, of any format that export --volume writes.
         as_json: Print JSON instead of a table.
     """
-    from ..io.volume_formats import read_volume_file
+    from ..io.formats import read_volume_file
     from ..report.run import report_run
     from ..workflows.evaluate import evaluate as score
     from ..workflows.evaluate import require_overlap, require_same_field

@@ -67,7 +67,7 @@ class TruthOptions:
     def require_usable(self, out: Path) -> None:
         """`InputError` unless all files, `out` among them, can be written."""
         from ..io.atomic import require_writable
-        from ..io.volume_formats import volume_format
+        from ..io.formats import volume_format
 
         require(self.truth is not None or not self.truth_frames, "--truth-frames needs --truth.")
         require(self.truth is not None or not self.truth_regions, "--truth-regions needs --truth.")
@@ -80,7 +80,7 @@ class TruthOptions:
 
     def volumes(self, times: int) -> list[tuple[Path, int]]:
         """Each volume file to write, and the number of its time, one of `times`."""
-        from ..io.volume_formats import of_time
+        from ..io.formats import of_time
 
         if self.truth is None:
             return []
@@ -313,7 +313,7 @@ def _write_frames(
 
 def _write_truth(path: Path, matter: Object, views: Views) -> None:
     from ..geometry import Grid
-    from ..io.volume_formats import write_volume_file
+    from ..io.formats import write_volume_file
 
     with ProgressBar() as bar:
         write_volume_file(path, matter, Grid.of_views(views), partial(bar.show, "voxels", record={}))

@@ -61,7 +61,7 @@ class VolumeOptions:
 
     def volume(self, paths: tuple[Path, ...], filling: Filling, energy_kev: float) -> VoxelScene:
         """The scene that the volume files `paths` describe."""
-        from ..io.volume_formats import StackMeaning, read_specimen
+        from ..io.formats import StackMeaning, read_specimen
         from ..matter import DeltaBeta
         from ..specimens.scene import VoxelScene
 
@@ -258,7 +258,7 @@ class SpecimenOptions:
         self, paths: tuple[Path, ...], beamline: BeamlineOptions, filling: Filling, duration: float = 0.0
     ) -> ContinuousScene | CarriedScene | VoxelScene | Drawn | None:
         """The specimen, unless `paths` are meshes; `InputError` for a mixture. duration: of its motion [s]."""
-        from ..io.volume_formats import FORMATS
+        from ..io.formats import FORMATS
 
         of_volume = [path for path in paths if path.suffix.lower() in FORMATS]
         if self.generated.specimen is not None:

@@ -16,11 +16,10 @@ import numpy as np
 
 from ..checks import InputError
 from ..geometry import Grid
+from .formats import FORMATS, HDF5_SUFFIXES, volume_format
 from .hdf5 import Fields, attribute_numbers, attribute_text, open_hdf5
 from .json import read_json
-from .ome_tiff import TIFF_SUFFIXES, ome_grid
-from .ome_zarr import ZARR_SUFFIX
-from .volume_formats import FORMATS, HDF5_SUFFIXES, volume_format
+from .ome import TIFF_SUFFIXES, ZARR_SUFFIX, ome_grid
 from .volumes import ABSORPTION, MU, REFRACTION, Contents
 from .vtk import SUFFIXES as MESHES
 from .vtk import mesh_files, read_meshes

@@ -146,7 +146,7 @@ def write_nerf_synthetic(
     a copy of the test's: most readers ask for one. Errors: `InputError` for views of several pixel sizes, since one
     angle of view serves all cameras.
     """
-    from .splats import write_ply  # needs torch, which takes longer than all else
+    from .solids import write_ply  # needs torch, which takes longer than all else
 
     _ = scan.views.pixel_size
     views, train = scan.views, np.flatnonzero(~scan.is_test)

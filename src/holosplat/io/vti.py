@@ -27,12 +27,11 @@ from ..progress import Advance
 from ..units import LENGTH_UNITS, unit_factor
 from ..volume import Object
 from .atomic import atomic_path
-from .guard import require_declared, require_memory, xml_fault
+from .guard import blocks_fault, require_declared, require_memory, xml_fault
 from .hdf5_writing import require_room
 from .plain_values import LENGTH_UNIT, fill, micrometres
 from .volumes import NAMES, REFRACTION, Contents, Stored, contents_of, grid_of
 from .vtk import BODY, TRIANGLE, quiet, save
-from .vtk_guard import blocks_fault
 
 UNIT = "length_unit"
 """The field array that says the unit of lengths."""

@@ -22,9 +22,8 @@ from ..checks import InputError, require, require_regular
 from ..mesh import TriangleMesh
 from ..units import LENGTH_UNITS, unit_factor
 from .atomic import atomic_path
-from .guard import xml_fault
+from .guard import blocks_fault, cells_fault, legacy_fault, ply_fault, xml_fault
 from .leftovers import is_hidden
-from .vtk_guard import blocks_fault, cells_fault, legacy_fault, ply_fault
 
 SUFFIXES = (".vtk", ".vtu", ".vtp")
 MERGE_TOLERANCE = 1e-6
