@@ -38,13 +38,10 @@ def _fetch(name: Positional[str], folder: Annotated[Path | None, arg(name="from"
 
     wanted = sample(name)
     path, options = fetched(wanted, folder)
-    again = f"$(holosplat data fetch {_again(name, folder)})"
+    words = name if folder is None else f"{name} --from {shlex.quote(str(folder))}"
+    again = f"$(holosplat data fetch {words})"
     say(f"{wanted.facts}\ngo on: {wanted.next.format(data=again)}")
     print(path, *options)
-
-
-def _again(name: str, folder: Path | None) -> str:
-    return name if folder is None else f"{name} --from {shlex.quote(str(folder))}"
 
 
 def data(

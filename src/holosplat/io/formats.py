@@ -212,10 +212,6 @@ def _content(path: Path) -> str:
 HDF5_SUFFIXES = (".h5", ".hdf5")
 
 
-def _alone(path: Path) -> tuple[Path, ...]:
-    return (path,)
-
-
 @dataclass(frozen=True)
 class VolumeFormat:
     """A format of volumes of δ and β. write: an object on a grid; files: all that it makes; needs: a package, which it
@@ -223,7 +219,7 @@ class VolumeFormat:
 
     write: Callable[[Path, Object, Grid, Advance, Contents], None]
     read: Callable[[Path], Stored]
-    files: Callable[[Path], tuple[Path, ...]] = _alone
+    files: Callable[[Path], tuple[Path, ...]] = lambda path: (path,)
     needs: Callable[[], Any] = lambda: None
 
 

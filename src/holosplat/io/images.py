@@ -279,8 +279,4 @@ def _folder(path: Path) -> Path:
     return path if path.is_dir() else path.parent
 
 
-def _read(path: Path, given: Mapping[str, float]) -> Scan:
-    return read_tiff(_folder(path))
-
-
-TIFF = Loader("tiff", f"a folder with {SCAN}, or an image in it", _is_own, _read)
+TIFF = Loader("tiff", f"a folder with {SCAN}, or an image in it", _is_own, lambda path, given: read_tiff(_folder(path)))

@@ -210,8 +210,7 @@ def _escaped(key: str) -> str:
     return escaped.replace(".", "%2E") if set(escaped) == {"."} else escaped
 
 
-def _recognises(path: Path) -> bool:
-    return path.is_file() and h5py.is_hdf5(path)
-
-
-LOADER = Loader("nxtomo", "an HDF5 file", _recognises, read_scan, (*RAW_TAKES, "entry"), open_scan, True)
+LOADER = Loader(
+    *("nxtomo", "an HDF5 file", lambda path: path.is_file() and h5py.is_hdf5(path)),
+    *(read_scan, (*RAW_TAKES, "entry"), open_scan, True),
+)

@@ -26,7 +26,9 @@ from .style import (
     PanelGrid,
     decimal_scale,
     from_dark,
+    grey_limits,
     image_panel,
+    largest,
     letter,
     scale_bar,
     styled,
@@ -98,8 +100,8 @@ def _surface_panel(axes: Axes, shown: SurfaceImage, grid: Grid) -> None:
 def held_out_figure(views: HeldOutViews, pixel_size: float, most: int = 4) -> Figure:
     """Measured, predicted and residual intensity of up to `most` test views; pixel_size [m]."""
     chosen = evenly_chosen(len(views.labels), most)
-    low, high = grey_limits(views)
-    limit = residual_limit(views)
+    low, high = grey_limits(views.measured)
+    limit = largest(views.predicted - views.measured)
     scale, power = decimal_scale(limit)
     height, width = views.measured.shape[1:]
     panels = PanelGrid(len(chosen), [width] * 3, [height] * 3, (1, 2))
@@ -122,17 +124,6 @@ def held_out_figure(views: HeldOutViews, pixel_size: float, most: int = 4) -> Fi
 def evenly_chosen(count: int, most: int) -> list[int]:
     """At most `most` of `count` indices, evenly spread, the first and the last among them."""
     return sorted({round(i) for i in np.linspace(0, count - 1, min(count, most))})
-
-
-def grey_limits(views: HeldOutViews) -> tuple[float, float]:
-    """The grey scale of holograms: the 0.2 and 99.8 percentiles of the measured test frames."""
-    low, high = np.percentile(views.measured, [0.2, 99.8])
-    return (float(low), float(high)) if high > low else (float(low) - 0.5, float(low) + 0.5)
-
-
-def residual_limit(views: HeldOutViews) -> float:
-    """The residuals' colour limit: the 99.8 percentile of their magnitude."""
-    return float(np.percentile(np.abs(views.predicted - views.measured), 99.8)) or 1.0
 
 
 @styled
@@ -190,7 +181,7 @@ def _projected(
         letter(axes[i], row * len(panels.axes[row]) + column + i, text)
     if len(shown) == 2:
         difference = (shown[1] - shown[0]) / scale
-        limit = float(np.percentile(np.abs(difference), 99.8)) or 1.0
+        limit = largest(difference)
         signed = image_panel(axes[2], difference, pitch, SIGNED_MAP, (-limit, limit))
         panels.bar(signed, 2, (row, row), "difference" + unit, "both")
 
@@ -226,7 +217,7 @@ def slices_figure(
     panels.bar(drawn, 2, (0, len(volumes) - 1), label)
     if truth is not None:
         difference = (reconstruction.delta - truth.delta) / scale
-        limit = float(np.percentile(np.abs(difference), 99.9)) or 1.0
+        limit = largest(difference, 99.9)
         drawn = slice_row(panels.axes[2], difference, truth.grid, positions, SIGNED_MAP, (-limit, limit))
         slice_titles(panels.axes[2], 6, "Difference", truth.grid, positions)
         panels.bar(drawn, 2, (2, 2), f"difference of {label}", "both")
