@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from ..align import AlignedViews, Calibrated, PoseOptions, PosePrior
     from ..matter import MaterialPrior
     from ..mesh import TriangleMesh
-    from ..optics.background import LightOptions
-    from ..scan import Exposures, Scan
+    from ..scan import Exposures
 
 LIGHT = LightFlags()
 """Even, unless the air of frames says otherwise."""
@@ -133,7 +132,7 @@ def align(
     """
     import numpy as np
 
-    from ..align import AlignedBeams
+    from ..align import AlignedBeams, align_views, find_axis
     from ..io.atomic import require_writable
     from ..io.formats import read_frames
     from ..io.nxtomo import write_scan
@@ -155,9 +154,13 @@ def align(
     prior = matter.prior(measured.exposures.reference_energy)
     errors, frames, missing, lasting = None, measured.source, measured.missing, np.arange(len(measured))
     if axis_only:
-        lines, exposures = _axis(measured, prior, illumination.options())
+        with ProgressBar() as bar:
+            light, show = illumination.options(), bar.of("axis")
+            axis = find_axis(measured, ratio=_ratio(prior), light=light, on_progress=show)
+        lines, exposures = axis.lines(), axis.applied(measured.exposures)
     else:
-        found = _views(measured, prior, how, illumination.options())
+        with ProgressBar() as bar:
+            found = align_views(measured, prior, how, light=illumination.options(), on_progress=bar.show)
         lines, exposures, errors = found.lines(), found.exposures, found.errors
         if isinstance(found, AlignedBeams):
             if any(found.sides):
@@ -174,23 +177,6 @@ def align(
     light = measured.light if frames is measured.source else None  # that of frames which were turned back is not known
     write_scan(out, Scan.of(frames, exposures, measured.is_test, facts, light, missing))
     say(f"wrote {out}: the same {len(measured)} frames, with other exposures")
-
-
-def _axis(scan: Scan, prior: MaterialPrior, light: LightOptions) -> tuple[list[str], Exposures]:
-    from ..align import find_axis
-
-    with ProgressBar() as bar:
-        show = bar.show
-        axis = find_axis(scan, ratio=_ratio(prior), light=light, on_progress=lambda done: show("axis", done, {}))
-    return axis.lines(), axis.applied(scan.exposures)
-
-
-def _views(scan: Scan, prior: MaterialPrior, options: PoseOptions, light: LightOptions) -> AlignedViews:
-    from ..align import align_views
-
-    with ProgressBar() as bar:
-        show = bar.show
-        return align_views(scan, prior, options, light=light, on_progress=lambda stage, done: show(stage, done, {}))
 
 
 def _write_geometry(
@@ -316,14 +302,8 @@ def calibrate(
     shape, measured = body.body(), read_frames(scan, reading).in_memory()
     material = filling.filling().of("", measured.exposures.reference_energy)
     with ProgressBar() as bar:
-        found = find(
-            measured,
-            MaterialPrior.known(material),
-            shape,
-            CalibrationOptions(unknown.prior(), unknown.uncertain_pixel),
-            light=illumination.options(),
-            on_progress=lambda stage, done: bar.show(stage, done, {}),
-        )
+        options, light = CalibrationOptions(unknown.prior(), unknown.uncertain_pixel), illumination.options()
+        found = find(measured, MaterialPrior.known(material), shape, options, light=light, on_progress=bar.show)
     put(found.lines())
     _write_beams(out, scan, found)
     say(f"wrote {out}: the geometry of {len(measured)} beams, for --exposures")

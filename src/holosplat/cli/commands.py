@@ -341,7 +341,7 @@ def demo(out: Output = Path("demo")) -> None:
     say(f"wrote {len(paths)} generated red cells to {meshes}")
     detector = "--detector {} {}".format(*DETECTOR)
     say(f"\n$ holosplat simulate {meshes}/*.vtk {detector} --views 16 --psf-sigma-px 0.05 --out {scan} --truth {truth}")
-    beamline = BeamlineOptions(DETECTOR, psf_sigma_px=0.05, views=16)
+    beamline = BeamlineOptions(detector=DETECTOR, psf_sigma_px=0.05, views=16)
     simulate(tuple(paths), beamline=beamline, out=scan, truth=TruthOptions(truth))
     say(f"\n$ holosplat reconstruct {scan} --material haemoglobin --out {run}")
     reconstruct(scan, run, Asked(PriorOptions(("haemoglobin",))))

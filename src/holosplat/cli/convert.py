@@ -76,7 +76,7 @@ class EveningOptions:
         prior = prior if prior.fixes_ratio else MaterialPrior.of_ratio(STAND_IN_RATIO)
         with ProgressBar() as bar:
             options = FixedPatternOptions(self.still_light, self.inside or 0.0)
-            found = flatfield_corrected(scan, prior, options, lambda stage, fraction: bar.show(stage, fraction, {}))
+            found = flatfield_corrected(scan, prior, options, bar.show)
         say(f"still light: {found.provenance['still_light']}")
         return found
 

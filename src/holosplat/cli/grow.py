@@ -28,7 +28,7 @@ def grow(out: Output, what: Growth, resume: bool = False) -> None:
     coarser = ((f"--frequency {f}", _needs(replace(what, frequency=f))) for f in range(what.frequency - 1, 2, -1))
     tell("grow", _needs(what), out, coarser)
     with interruptible(lambda: _cut_off(SeriesFolder(out))), sole_writer(out), ProgressBar() as bar:
-        grown = run(what, out, resume, lambda fraction: bar.show("cells in flow", fraction, {}))
+        grown = run(what, out, resume, bar.of("cells in flow"))
     say(
         f"wrote {SeriesFolder(out).collection}: {grown.snapshots} snapshots of {what.cells} cells, "
         f"{what.period:.4g} s apart; {grown.state.taken} steps, {grown.state.refused} refused; "

@@ -52,7 +52,7 @@ def dataset(
     tell("the dataset", _needs(drawn, left, jobs), out, fewer)
     with ProgressBar() as bar:
         with interruptible(lambda: f"interrupted; {out} keeps its whole files, and the same command goes on"):
-            made = make_dataset(wanted, jobs, lambda fraction: bar.show("scenes", fraction, {}))
+            made = make_dataset(wanted, jobs, bar.of("scenes"))
         done = [
             export(wanted, layout, lambda part, layout=layout: bar.show(f"{layout} files", part, {}))
             for layout in layouts
@@ -106,9 +106,7 @@ def train(
     training = (kind.resumed if resume else kind.begun)(scenes, out, how)
     who = made_by(how.device)  # before files change under hours of work
     with ProgressBar() as bar:
-        told = Validation.of(
-            scenes.ranges, scenes.seed, how.validation, lambda fraction: bar.show("scenes to validate", fraction, {})
-        )
+        told = Validation.of(scenes.ranges, scenes.seed, how.validation, bar.of("scenes to validate"))
         if how.network != "start":
             told = AlignedValidation(told.samples, network=how.network)
         with interruptible(lambda: f"interrupted; {out} keeps the last checkpoint, go on with --resume"):

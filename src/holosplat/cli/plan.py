@@ -175,12 +175,7 @@ def plan(
     surveyed = None
     if ranges.wanted:
         with ProgressBar() as bar:
-            surveyed = ranges.run(
-                subject,
-                beam,
-                record.photons_per_pixel,
-                lambda fraction: bar.show("surveying", fraction, {}),
-            )
+            surveyed = ranges.run(subject, beam, record.photons_per_pixel, bar.of("surveying"))
     if as_json:
         print(json.dumps(_as_dict(what.name(), beam, record, planned, surveyed), indent=2, allow_nan=False))
     else:

@@ -82,15 +82,8 @@ def retrieve(
     measured = read_frames(scan, reading).in_memory()
     material, level = matter.at(measured.exposures.reference_energy)
     with ProgressBar() as bar:
-        found = act(
-            measured.frames,
-            measured.exposures,
-            material,
-            method,
-            light=illumination.options(),
-            missing=measured.missing,
-            on_progress=lambda fraction: bar.show("phase retrieval", fraction, {}),
-        )
+        how = {"light": illumination.options(), "missing": measured.missing, "on_progress": bar.of("phase retrieval")}
+        found = act(measured.frames, measured.exposures, material, method, **how)
     words = found.light.in_words
     maps = {"phase": found.phase.numpy()}
     if level:

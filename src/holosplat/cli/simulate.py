@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -243,7 +242,7 @@ def _specimen(
                 "all bodies at once; for a series give --frame-rate."
             )
         return _Specimen(matter, np.zeros(1), _facts(matter))
-    show = partial(bar.show, "reading snapshots", record={})
+    show = bar.of("reading snapshots")
     series, times = read_series(meshes, filling, beamline.energy_kev, timing, files.series(), show)
     facts = {"frame_rate_hz": f"{timing.frame_rate:g}", "snapshots": str(len(series.snapshots))}
     return _Specimen(series, times, _facts(series.snapshots[0]) | facts)
@@ -316,4 +315,4 @@ def _write_truth(path: Path, matter: Object, views: Views) -> None:
     from ..io.formats import write_volume_file
 
     with ProgressBar() as bar:
-        write_volume_file(path, matter, Grid.of_views(views), partial(bar.show, "voxels", record={}))
+        write_volume_file(path, matter, Grid.of_views(views), bar.of("voxels"))
