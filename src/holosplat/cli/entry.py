@@ -56,7 +56,7 @@ GROUPS: dict[str, dict[str, str]] = {
         "surface": "surface",
     },
     "Look": {"evaluate": "commands", "view": "view", "export": "export", "render": "commands", "compare": "compare"},
-    "Series": {"series": "series", "watch": "watch", "forecast": "forecast"},
+    "Series": {"series": "series", "watch": "series", "forecast": "forecast"},
     "Learn": {"dataset": "learn", "train": "learn"},
     "Benchmark and installation": {"demo": "commands", "doctor": "data", "backends": "commands"},
 }

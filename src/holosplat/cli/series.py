@@ -1,9 +1,9 @@
-"""`holosplat series`: many times as tasks of their own, on this machine, by Slurm, or on a Dask cluster."""
+"""`holosplat series | watch`: many times as tasks of their own, here, by Slurm or on Dask, and scans as they appear."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,9 +18,11 @@ from ..series.collect import collect as join
 from ..series.folder import Row, SeriesFolder, line_of, some, table_of, time_left
 from ..series.plan import Cut, Settings, Slurm, Warm, plan_series
 from ..series.run import run_left
+from ..series.watch import Watch, WatchFolder, Watching
+from ..tables import to_table
 from .light import RunLightFlags
 from .options import MethodOptions, PriorOptions
-from .places import Output, with_checked_arguments
+from .places import Kept, Output, with_checked_arguments
 from .room import tell_each_time
 from .sentence import interruptible, put, say
 from .track import BodyFlags, MotionFlags
@@ -273,3 +275,45 @@ def reconstruct_each(
     say(f"wrote {folder.table}, {folder.page}; each time is a run folder in {folder.task(0)}")
     if counts.failed or counts.left:
         raise SystemExit(UNFINISHED)
+
+
+WATCHING, EACH_SCAN, EVEN = Watching(), EachTime(), RunLightFlags()
+"""What is done without options."""
+
+
+def watch(
+    folder: Positional[Path],
+    out: Kept,
+    how: Watching = WATCHING,
+    each: EachTime = EACH_SCAN,
+    matter: PriorOptions = PriorOptions(),
+    method: MethodOptions = MethodOptions(),
+    reading: Reading = Reading(),
+    *,
+    illumination: RunLightFlags = EVEN,
+    seed: Seed = 0,
+) -> None:
+    """Reconstruct scans as they appear in a folder, each begun with what the last one gave, and keep a live page.
+
+    The page is OUT/live.html, which a browser opens without a server. Ctrl-C ends the watch, and the same command goes
+    on where it was.
+
+    Args:
+        folder: Folder to watch; files in it, not those of folders in it.
+        out: Folder of the results, new or to go on with.
+        seed: Seed of everything random.
+    """
+    require(not matter.ranges(), "a watch needs one number for --delta-beta; find it by reconstruct of one scan.")
+    require(reading.part.time_frame is None, "a watch takes all times of a scan; choose some with --time-frames.")
+    settings = Act(each, method, illumination=illumination).settings(track=False, seed=seed)
+    said = {
+        "folder": str(folder.resolve()),
+        "settings": to_table(settings.as_table()),
+        "matter": asdict(matter),
+        "reading": reading.as_table(),
+    }
+    result = WatchFolder(out)
+    say(f"watching {folder}; the page is {result.page}; Ctrl-C ends")
+    with interruptible(lambda: f"ended; what {out} holds is whole, and the same command goes on from there"):
+        count = Watch(folder, result, settings, matter.prior, reading, how, say).run(said)
+    say(f"ended after {count} scan(s)")

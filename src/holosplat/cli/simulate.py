@@ -25,8 +25,7 @@ from .places import Output
 from .progress import ProgressBar
 from .room import tell_simulation
 from .sentence import say
-from .source import NO_SPECTRUM, SourceOptions
-from .specimen import SpecimenOptions
+from .specimen import NO_SPECTRUM, SourceOptions, SpecimenOptions
 
 if TYPE_CHECKING:
     import numpy as np

@@ -29,10 +29,9 @@ from ..workflows.run_folder import RunFolder
 from .content import DELTA, Quantity, flatten
 from .curves import correlation_figure
 from .figures import richest_planes, slices_figure
-from .page import template
+from .page import Table, duration, resolved, template
 from .run import LARGEST_VOLUME
 from .style import Block, drawn_block, format_length, in_print, scientific
-from .tables import Table, duration, resolved
 
 HEAD = ("", "A", "B")
 ON_THE_WAY = ("decided", "resolved")
