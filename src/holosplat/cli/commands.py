@@ -183,7 +183,7 @@ def reconstruct(
             told = {"on_progress": follow.on_progress, "on_state": follow.on_state}
             result = fit(measured, prior, method, seed, folder=folder, resume=resume, **ways, **told)
         evaluation, report = _scored(folder, result, measured, scan, reading)
-    _print_scores(evaluation)
+    put(evaluation.lines())
     _print_result(folder, result, report)
     _end(result, out, strict)
 
@@ -239,8 +239,7 @@ def _print_result(folder: RunFolder, result: Reconstruction, report: Path) -> No
 
     if folder.light.is_file():
         say(f"light: {read_json(folder.summary)['light']} ({folder.light})")
-    for constant in result.constants:
-        print(constant.line())
+    put(constant.line() for constant in result.constants)
     put(result.geometry.lines() if result.geometry else ())
     put(result.choice.lines())
     say(f"{sum(result.timing.values()):.1f} s, {result.object.described}; report: {report}")
@@ -316,7 +315,7 @@ def evaluate(
     if as_json:
         print(json.dumps(evaluation.as_dict(), indent=2, allow_nan=False))
     else:
-        _print_scores(evaluation)
+        put(evaluation.lines())
     if instants_of(folder):
         return  # its report is of the time in the middle
     if not folder.is_of(scan_hash(measured)):
@@ -369,7 +368,3 @@ def _auto() -> str:
         return f"would take {resolve('auto')}"
     except InputError:
         return "finds neither cpu nor cuda"
-
-
-def _print_scores(evaluation: Evaluation) -> None:
-    put(evaluation.lines())
