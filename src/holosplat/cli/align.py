@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from ..mesh import TriangleMesh
     from ..scan import Exposures
 
-LIGHT = LightFlags()
-"""Even, unless the air of frames says otherwise."""
 
 TOML = ".toml"
 
@@ -116,7 +114,7 @@ def align(
     unknown: UncertainOptions = UncertainOptions(),
     reading: Reading = Reading(),
     *,
-    illumination: LightFlags = LIGHT,
+    illumination: LightFlags = LightFlags(),
     axis_only: bool = False,
     table: Output | None = None,
     geometry_out: Output | None = None,
@@ -270,18 +268,15 @@ class DoubtOptions(PoseFlags):
     """Pixel size, as a share of it."""
 
 
-DOUBT = DoubtOptions(5.0, 2.0, 2.0, 0.05)
-
-
 def calibrate(
     scan: Positional[Path],
     out: Output,
     body: BodyOptions,
     filling: MaterialOptions = MaterialOptions(),
-    unknown: DoubtOptions = DOUBT,
+    unknown: DoubtOptions = DoubtOptions(5.0, 2.0, 2.0, 0.05),
     reading: Reading = Reading(),
     *,
-    illumination: LightFlags = LIGHT,
+    illumination: LightFlags = LightFlags(),
 ) -> None:
     """Find where beams are by frames of a phantom of known shape, or of beads, for --exposures of other commands.
 

@@ -69,8 +69,6 @@ class CarriedFlags:
         )
 
 
-LIVE = LiveFlags()
-"""Nobody watches."""
 UNEXPLAINED = 3
 """Exit code of `reconstruct --strict` where frames are not explained."""
 
@@ -120,20 +118,16 @@ class Asked:
         return {"matter": kind, "light": light, "uncertain": uncertain, "refine": refine}
 
 
-USUAL = Asked()
-"""What is asked without options."""
-
-
 def reconstruct(
     scan: Positional[Path],
     out: Output,
-    asked: Annotated[Asked, arg(name="")] = USUAL,
+    asked: Annotated[Asked, arg(name="")] = Asked(),
     seed: Seed = 0,
     resume: bool = False,
     reading: Reading = Reading(),
     *,
     strict: bool = False,
-    live: LiveFlags = LIVE,
+    live: LiveFlags = LiveFlags(),
 ) -> None:
     """Reconstruct a scan, by what suits its matter or by a method of your choice, into a run folder.
 

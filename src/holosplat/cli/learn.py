@@ -20,14 +20,12 @@ if TYPE_CHECKING:
 
 Layout = Literal["nerf-synthetic", "r2-gaussian", "onix"]
 """Those of `training.export`, which loads torch."""
-DRAWN = Ranges()
-"""Red cells under ideal light."""
 
 
 def dataset(
     out: Kept,
     count: Annotated[int, Within(1, 10**6)] = 1000,
-    drawn: Annotated[Ranges, OmitArgPrefixes] = DRAWN,
+    drawn: Annotated[Ranges, OmitArgPrefixes] = Ranges(),
     seed: Seed = 0,
     jobs: Jobs = 1,
     layouts: Annotated[tuple[Layout, ...], arg(name="export")] = (),
@@ -74,12 +72,11 @@ def _needs(drawn: Ranges, scenes: int, jobs: int) -> Needs:
     return of_dataset(max(ends, key=lambda needs: needs.memory), (drawn.rows, drawn.columns), views, scenes, jobs)
 
 
-DEFAULT = TrainOptions()
-"""More steps than the weights of the package were made with: their card says how many."""
-
-
 def train(
-    data: Positional[Path], out: Output, how: Annotated[TrainOptions, OmitArgPrefixes] = DEFAULT, resume: bool = False
+    data: Positional[Path],
+    out: Output,
+    how: Annotated[TrainOptions, OmitArgPrefixes] = TrainOptions(),
+    resume: bool = False,
 ) -> None:
     """Train a network on scenes of `holosplat dataset`: weights with a card, and curves.
 

@@ -70,10 +70,6 @@ class Act:
         return Settings("reconstruct", self.how.chosen(), self.how.kind_of_matter(), warm, **shared)
 
 
-ACT, WINDOWS = Act(), Cut()
-"""What is done without options."""
-
-
 def _changed(*groups: object) -> list[str]:
     """Names of fields that are not as they are without options."""
     pairs = [(group, type(group)()) for group in groups]
@@ -102,16 +98,12 @@ class SlurmFlags(Slurm):
         say(f"submit it by: sbatch {folder.script}")
 
 
-NO_SLURM = SlurmFlags()
-"""It is not asked for."""
-
-
 def plan(
     scans: Positional[tuple[Path, ...]],
     out: Output,
-    windows: Cut = WINDOWS,
+    windows: Cut = Cut(),
     matter: PriorOptions = PriorOptions(),
-    act: Annotated[Act, arg(name="")] = ACT,
+    act: Annotated[Act, arg(name="")] = Act(),
     reading: Reading = Reading(),
     *,
     seed: Seed = 0,
@@ -143,7 +135,7 @@ def run(
     jobs: Jobs = 0,
     retry: bool = False,
     dask: str | None = None,
-    cluster: SlurmFlags = NO_SLURM,
+    cluster: SlurmFlags = SlurmFlags(),
     allow_external: bool = False,
 ) -> None:
     """Do one task of a series, or all that are left; what is done already is not done again.
@@ -277,20 +269,16 @@ def reconstruct_each(
         raise SystemExit(UNFINISHED)
 
 
-WATCHING, EACH_SCAN, EVEN = Watching(), EachTime(), RunLightFlags()
-"""What is done without options."""
-
-
 def watch(
     folder: Positional[Path],
     out: Kept,
-    how: Watching = WATCHING,
-    each: EachTime = EACH_SCAN,
+    how: Watching = Watching(),
+    each: EachTime = EachTime(),
     matter: PriorOptions = PriorOptions(),
     method: MethodOptions = MethodOptions(),
     reading: Reading = Reading(),
     *,
-    illumination: RunLightFlags = EVEN,
+    illumination: RunLightFlags = RunLightFlags(),
     seed: Seed = 0,
 ) -> None:
     """Reconstruct scans as they appear in a folder, each begun with what the last one gave, and keep a live page.

@@ -109,9 +109,6 @@ class TruthOptions:
 
 MOST_FRAMES = 10**6
 """Frames of a scan, at most: more take hours on the smallest of detectors."""
-NO_TRUTH = TruthOptions()
-MESHES = SpecimenOptions()
-"""What is imaged unless options say otherwise."""
 
 
 @dataclass(frozen=True)
@@ -146,10 +143,10 @@ def simulate(
     *,
     beamline: BeamlineOptions,
     out: Output,
-    imaged: SpecimenOptions = MESHES,
+    imaged: SpecimenOptions = SpecimenOptions(),
     filling: MaterialOptions = MaterialOptions(),
     experiment: ExperimentOptions = ExperimentOptions(),
-    truth: TruthOptions = NO_TRUTH,
+    truth: TruthOptions = TruthOptions(),
 ) -> None:
     """Simulate the holograms of closed meshes, still or moving (--frame-rate), of a volume, or of generated matter.
 

@@ -118,25 +118,17 @@ class MotionFlags:
         )
 
 
-USUAL = MotionFlags()
-"""As the method has it."""
-LIGHT = LightFlags()
-"""Even, unless the air of frames says otherwise."""
-UNKNOWN = BodyFlags()
-"""Nothing."""
-
-
 def track(
     scan: Positional[Path],
     out: Output,
     matter: PriorOptions = PriorOptions(),
-    how: MotionFlags = USUAL,
+    how: MotionFlags = MotionFlags(),
     seed: Seed = 0,
     resume: bool = False,
     reading: Reading = Reading(),
     *,
-    illumination: LightFlags = LIGHT,
-    known: BodyFlags = UNKNOWN,
+    illumination: LightFlags = LightFlags(),
+    known: BodyFlags = BodyFlags(),
 ) -> None:
     """Follow closed bodies through the times of a scan: their shapes on smooth paths, into a run folder.
 
