@@ -75,7 +75,7 @@ def read_array(path: Path, what: str) -> np.ndarray:
 def mapped_array(path: Path, what: str) -> np.ndarray:
     """The same, whose values are read when they are asked for."""
     require_regular(path, what)
-    with _numpy(path, f"{what} (.npy)"):
+    with undamaged(path, f"{what} (.npy)"):
         with path.open("rb") as file:
             declared = _declared(file)
         if declared > path.stat().st_size:
@@ -93,7 +93,7 @@ def read_archive(
     """The arrays in an .npz file, which must be `what`, by name, of all names or those in `names`; `InputError` for any
     other file, for one that declares more than it can hold, and for more than there is memory for."""
     require_regular(path, what)
-    with _numpy(path, f"{what} (.npz)"), zipfile.ZipFile(path) as archive:
+    with undamaged(path, f"{what} (.npz)"), zipfile.ZipFile(path) as archive:
         for part in archive.infolist():
             with archive.open(part) as file:
                 declared = _declared(file)
@@ -111,8 +111,8 @@ def read_archive(
 
 
 @contextmanager
-def _numpy(path: Path, what: str) -> Iterator[None]:
-    """`InputError` in place of what numpy and zipfile raise, of many kinds, for damaged files."""
+def undamaged(path: Path, what: str) -> Iterator[None]:
+    """`InputError` in place of what libraries raise, of many kinds, for a damaged file, which must be `what`."""
     try:
         yield
     except (InputError, MemoryError):

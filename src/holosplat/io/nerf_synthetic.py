@@ -20,6 +20,7 @@ from ..geometry import Views
 from ..ranges import Metres, Positive, Signed, Small, ranged
 from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, Scan, checked_distance
 from .atomic import atomic_folder
+from .guard import undamaged
 from .json import write_json
 from .raw_file import Loader, folder_with, require_said, stand_in
 from .seeds import hull_points, uniform_points
@@ -45,11 +46,8 @@ def read_png(path: Path) -> tuple[np.ndarray, int]:
 
     Colours must be equal and alpha opaque; `InputError` otherwise, or if the file is damaged.
     """
-    try:
-        with Image.open(path, formats=("PNG",)) as image:
-            mode, values = image.mode, np.asarray(image)
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise InputError(f"{path} must be a complete PNG image, but it is damaged or none: {error}.") from None
+    with undamaged(path, "a complete PNG image"), Image.open(path, formats=("PNG",)) as image:
+        mode, values = image.mode, np.asarray(image)
     if mode.startswith("I"):  # 16 bits: "I;16", and "I" in older versions of Pillow
         return values, LEVELS["grey16"]
     require(mode in ("L", "LA", "RGB", "RGBA"), f"{path} must be a grey image of 8 or 16 bits, but its kind is {mode}.")

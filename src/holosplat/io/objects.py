@@ -8,7 +8,8 @@ from the first's whole numbers where that takes less, and else by itself.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -37,23 +38,29 @@ def write_object(path: Path, obj: Stored, marks: Mapping[str, str] = MappingProx
     """Write an Object: the attributes `format`, `kind` and `state` (JSON), and a dataset for each of its tensors.
 
     marks: further attributes."""
-    tensors, plain = parted(obj.state())
-    text = json.dumps(plain)
-    assert len(text) < MOST_TEXT
-    with new_hdf5(path) as file:
-        file.attrs.update(marks, format=FORMAT, kind=obj.kind, state=text)
+    with _new_object(path, obj, FORMAT, marks) as (file, tensors):
         for name, tensor in tensors.items():
             put(file, name, tensor.detach().cpu().numpy())
 
 
-def write_compact(path: Path, obj: Stored, steps: compact.Steps) -> None:
-    """Write an Object in few bytes, as near as `steps` say; `read_object` reads it."""
-    tensors, plain = parted(compact.ordered(obj, compact.order_of(obj)).state())
+def write_compact(path: Path, obj: Stored, steps: Steps) -> None:
+    """Write an Object in few bytes, as near as `steps` say (`put_whole`); `read_object` reads it."""
+    with _new_object(path, ordered(obj, order_of(obj)), compact.FORMAT) as (file, tensors):
+        for name, tensor in tensors.items():
+            put_whole(file, name, Whole.of(name, tensor, steps))
+
+
+@contextmanager
+def _new_object(
+    path: Path, obj: Stored, form: str, marks: Mapping[str, str] = MappingProxyType({})
+) -> Iterator[tuple[h5py.File, dict[str, Tensor]]]:
+    """A new file with all of an Object but its tensors, and these."""
+    tensors, plain = parted(obj.state())
     text = json.dumps(plain)
     assert len(text) < MOST_TEXT
     with new_hdf5(path) as file:
-        file.attrs.update(format=compact.FORMAT, kind=obj.kind, state=text)
-        compact.encode(file, tensors, steps)
+        file.attrs.update(marks, format=form, kind=obj.kind, state=text)
+        yield file, tensors
 
 
 def read_object(path: Path) -> Stored:
@@ -74,8 +81,11 @@ def read_object(path: Path) -> Stored:
             )
         fields, names = Fields(path, file), list[str]()
         file.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
-        decoded = compact.decode if form == compact.FORMAT else lambda dataset, label: np.asarray(dataset[()])
-        arrays = {n: sound(fields.label(n), decoded(fields.dataset(n), fields.label(n))) for n in names}
+        arrays = dict[str, np.ndarray]()
+        for name in names:
+            dataset, label = fields.dataset(name), fields.label(name)
+            few = form == compact.FORMAT
+            arrays[name] = sound(label, get_whole(dataset, label).values() if few else np.asarray(dataset[()]))
         with as_written(path, "a whole object"):
             plain = json.loads(str(file.attrs["state"]))
             require_plausible(plain)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..checks import InputError, MissingError, note, require, require_regular
-from .guard import RATIO, SMALL, mapped_array, require_declared, require_inflated, require_memory
+from .guard import RATIO, SMALL, mapped_array, require_declared, require_inflated, require_memory, undamaged
 from .leftovers import is_hidden
 
 IMAGES = (".tif", ".tiff", ".png")
@@ -100,16 +100,12 @@ def _pages(file: Path) -> list[int]:
 
 def _image(file: Path, page: int) -> np.ndarray:
     """One grey image [H, W]; of a coloured one whose colours are equal, one of them."""
-    try:
+    with undamaged(file, "a complete image"):
         if file.suffix.lower() == ".png":
             image = _png(file)
         else:
             with open_tiff(file) as opened:
                 image = image_values(opened, file, page)
-    except InputError:
-        raise
-    except Exception as error:  # tifffile and Pillow raise many kinds for damaged files
-        raise InputError(f"{file} must be a complete image, but it is damaged or none: {error}.") from None
     if image.ndim == 3 and image.shape[2] in (3, 4) and (image[..., :3] == image[..., :1]).all():
         image = image[..., 0]
     grey = image.ndim == 2 and image.dtype.kind in "iuf"
