@@ -12,11 +12,10 @@ import numpy as np
 
 from ..bodies.rest_shape import moments
 from ..checks import InputError, is_of_memory, require
-from ..io.formats import read_frames
+from ..io.formats import read_frames, run_source
 from ..io.json import write_json
 from ..io.lock import sole_writer
 from ..io.reading import Reading
-from ..io.run_scan import run_source
 from ..metrics import ImageScores
 from ..representations import MovingSurfaces
 from ..scan import Scan
