@@ -18,6 +18,7 @@ from helpers.splats import cloud
 from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta, Matter
 from holosplat.model import Instrument
+from holosplat.report.run import phase_ends
 from holosplat.report.view3d import view as packing
 from holosplat.report.view3d.view import View3D, ViewPart, binned, html, packed, part_of, raster_of, volume_part
 from holosplat.representations import GaussianCloud, MovingSurfaces, SurfaceMesh
@@ -80,7 +81,15 @@ def view() -> View3D:
     exposures = Exposures.of(views[[0]], 20.0, 0.05, 0.7)
     slices = {"lump": volume_part(LUMP, RASTER, 10**9)}
     labels = ("one", "two", "three", "<b>four</b>")
-    return View3D(parts, slices, exposures, views, labels, (0.9, 1.1), 1.0, "data:image/png;base64,")
+    return View3D(parts, slices, exposures, views, labels, (0.9, 1.1), (0.0, 1.0), "data:image/png;base64,")
+
+
+@pytest.mark.parametrize(("sign", "ends"), [(1.0, (0.0, 2.0)), (-1.0, (0.0, -2.0))])
+def test_colours_of_the_phase_begin_at_nothing_unless_matter_is_on_both_sides(sign, ends):
+    phase = sign * np.linspace(0, 2, 35).reshape(5, 7)
+    assert phase_ends(phase, sign) == pytest.approx(ends, abs=0.02)
+    low, high = phase_ends(phase - sign, sign)
+    assert (low, high) == pytest.approx((-sign, sign), abs=0.02)
 
 
 # --- what is stored -----------------------------------------------------------------------------------------

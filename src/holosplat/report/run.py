@@ -280,7 +280,7 @@ def view_of(obj: Stored, volume: Volume, truth: Volume | None, scan: Scan, delta
         views=scan.views,
         labels=view_labels(scan.views),
         grey=(float(low), float(max(high, low + 1e-6))),
-        top=sign * (float(np.percentile(sign * shift, ENDS[1])) or 1.0),
+        ends=phase_ends(shift, sign),
         picture=still_picture(shift, sign),
         delta_told=delta_told,
     )
@@ -294,12 +294,19 @@ def first_phase(obj: Stored, scan: Scan) -> np.ndarray:
     return float(wavenumber(exposures.energy_kev)[0]) * delta[0].numpy()
 
 
+def phase_ends(phase: np.ndarray, sign: float = 1.0) -> tuple[float, float]:
+    """Values between which a phase is shown; sign: that of the matter's δ. They have 0 between them or at an end."""
+    low, high = (float(value) for value in np.percentile(sign * phase, (100 - ENDS[1], ENDS[1])))
+    return sign * min(low, 0.0), sign * (max(high, 0.0) or 1.0)
+
+
 @styled
 def still_picture(phase: np.ndarray, sign: float = 1.0) -> str:
     """The picture that stands where the view cannot be turned, as a `data:` URI; sign: that of the matter's δ."""
     rows, columns = phase.shape
     figure = new_figure(2.4, 2.4 * rows / columns, layout="none")
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    axes.imshow(sign * phase, cmap="magma", vmin=0.0)
+    low, high = phase_ends(phase, sign)
+    axes.imshow(sign * phase, cmap="magma", vmin=sign * low, vmax=sign * high)
     axes.axis("off")
     return data_uri(figure, "png")

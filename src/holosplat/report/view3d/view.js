@@ -381,7 +381,7 @@ function start(buffer) {
   const told = facts.delta_told, [name, unit, factor] = told ? ["Phase shift −φ", "rad", facts.k] : ["Absorption 2k∫β dz", "", 2 * facts.k];
   const lined = ({ delta, beta }) => (told ? delta : beta);
   const [cutName, cutUnit, cutFactor] = told ? ["δ", "", 1] : ["µ", "m⁻¹", 2 * facts.k];
-  const warm = shade(0, facts.top, facts.colours), grey = shade(...facts.grey);
+  const warm = shade(...facts.phase, facts.colours), grey = shade(...facts.grey);
   let shown, pending = 0;
 
   function look() {
@@ -450,7 +450,7 @@ function start(buffer) {
   };
   pick("shown").textContent = name;
   pick("slice-shown").textContent = `Slice of ${cutName}`;
-  bar("phase", 0, facts.top, warm, unit);
+  bar("phase", ...facts.phase, warm, unit);
   bar("hologram", ...facts.grey, grey);
   for (const each of ["phase", "hologram"]) ruler(each, columns * facts.pixel);
   state.depth = Math.floor((Object.values(slices)[0]?.arrays.values.shape[1] ?? 1) / 2);

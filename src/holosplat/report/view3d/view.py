@@ -43,8 +43,8 @@ class View3D:
 
     parts: the first is shown at first; slices: volumes of some of the parts; exposures: of the frame that the view
     imitates (one); views: of the scan, which can be chosen; labels: theirs; grey: limits of the frames' grey scale;
-    delta_told: whether δ is known, and with it the phase; else absorption is shown; top: the phase shift [rad], or the
-    absorption, at which colours end; picture: the first view as a `data:` URI, where WebGL is missing.
+    delta_told: whether δ is known, and with it the phase; else absorption is shown; ends: the phase shift [rad], or the
+    absorption, between which colours go; picture: the first view as a `data:` URI, where WebGL is missing.
     """
 
     parts: Mapping[str, ViewPart]
@@ -53,7 +53,7 @@ class View3D:
     views: Views
     labels: tuple[str, ...]
     grey: tuple[float, float]
-    top: float
+    ends: tuple[float, float]
     picture: str = ""
     delta_told: bool = True
 
@@ -108,7 +108,7 @@ def packed(view: View3D) -> tuple[dict[str, Any], bytes]:
         "shifts": (view.views.shifts[:MOST_VIEWS] / pixel).round(5).tolist(),
         "labels": list(view.labels[:MOST_VIEWS]),
         "grey": list(view.grey),
-        "top": view.top,
+        "phase": view.ends,
         "delta_told": view.delta_told,
         "colours": _colours(),
     }, bytes(blob)
