@@ -11,7 +11,7 @@ import torch
 
 from ..baselines.material import MaterialEstimate
 from ..fit.pose_refinement import PoseRefinement, with_alignment
-from ..fit.running import Running
+from ..fit.run import Running
 from ..inference import Decision
 from ..learning.start import GuessedMatter
 from ..matter import MaterialPrior, MatterKind

@@ -14,7 +14,7 @@ from ..bodies.rest_shape import KnownBody, moments, stretched_like
 from ..bodies.search import BodySearch, sized
 from ..bodies.shadows import Shadows
 from ..checks import require
-from ..fit.running import Steps
+from ..fit.run import Run
 from ..geometry import Views
 from ..matter import DeltaBeta, Matter
 from ..mesh import TriangleMesh
@@ -49,23 +49,22 @@ class KnownBodies:
         begun: MovingSurfaces | None = None,
         seed: int = 0,
         on_progress: Heard = lambda share: None,
-        steps: Steps | None = None,
+        run: Run | None = None,
     ) -> MovingSurfaces | None:
         """Bodies on paths of `basis` that explain what `known` ones leave of the frames; None where there are none.
 
         begun: bodies of any shape with which the search may begin; `of_begun` says whether it did. The first search
-        finds the size of all bodies. steps: in which it is done.
+        finds the size of all bodies. run: keeps the steps.
         """
-        steps = steps or Steps()
         search, mesh = self.search, sized(self.search.mesh, self.size)
         if known is not None:
             search = replace(search, seen=self.seen.without(self._shadows(known)))
         like = [] if begun is None else poses_like(begun, mesh, (self.first, self.last), self.pixel * self.bin)
-        found, self.of_begun = search.poses(self.velocities, like, self.size, seed, on_progress, steps)
+        found, self.of_begun = search.poses(self.velocities, like, self.size, seed, on_progress, run)
         if not found:
             return None
         if known is None and self.body.uncertain > 0:
-            self.size, found = search.of_best_size(found, self.size, steps)
+            self.size, found = search.of_best_size(found, self.size, run)
         return self._paths([pose.scaled(self.bin) for pose in found], basis)
 
     def _shadows(self, bodies: MovingSurfaces) -> np.ndarray:

@@ -1,19 +1,15 @@
-"""How bodies are followed through time: the options of `track`, and the journal of a run."""
+"""How bodies are followed through time: the options of `track`."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Protocol
-
-import torch
+from typing import ClassVar
 
 from ..bodies.rest_shape import KnownBody
 from ..fit.schedule import Schedule
 from ..learning.start import LearnedStart
-from ..mesh import TriangleMesh
 from ..ranges import Share, ranged
-from .detections import Detection, SightingOptions
+from .detections import SightingOptions
 from .fit import MotionFit, converged
 from .pieces import PathOptions
 from .track_linking import LinkOptions
@@ -75,52 +71,3 @@ class TrackOptions:
             for name, part in parts.items()
         }
         return replace(self, **changed)
-
-
-class Journal(Protocol):
-    """Keeps the last state of a run: tensors, and plain values."""
-
-    def load(self) -> Mapping[str, Any] | None:
-        """Load the last saved state; None at the beginning."""
-        ...
-
-    def save(self, state: Mapping[str, Any]) -> None:
-        """Keep `state` in place of what was saved before."""
-        ...
-
-
-class Nowhere:
-    """Keeps nothing."""
-
-    def load(self) -> None:
-        """Load nothing."""
-
-    def save(self, state: Mapping[str, Any]) -> None:
-        """Forget it."""
-
-
-def from_sightings(found: Sequence[Sequence[Detection]]) -> list[list[dict[str, Any]]]:
-    """Sightings at each time as tensors and plain values, which `to_sightings` reads."""
-    return [
-        [
-            {
-                "vertices": torch.from_numpy(one.mesh.vertices),
-                "faces": torch.from_numpy(one.mesh.faces),
-                "name": one.mesh.name,
-                "cut": one.cut,
-            }
-            for one in bodies
-        ]
-        for bodies in found
-    ]
-
-
-def to_sightings(saved: Sequence[Sequence[Mapping[str, Any]]]) -> list[list[Detection]]:
-    """The inverse of `from_sightings`."""
-    return [
-        [
-            Detection(TriangleMesh(one["vertices"].numpy(), one["faces"].numpy(), one["name"]), bool(one["cut"]))
-            for one in bodies
-        ]
-        for bodies in saved
-    ]

@@ -11,7 +11,7 @@ import torch
 
 from ..bodies.poses import distance, map_near, twin_map, two_beams
 from ..bodies.rest_shape import moments, second_moments
-from ..fit.running import Steps
+from ..fit.run import Run
 from ..inference import Compared, Decision, Score
 from ..mesh import TriangleMesh
 from ..optics.background import Light
@@ -49,8 +49,8 @@ def trial_of(how: MotionFit, steps: int) -> MotionFit:
 
 @dataclass(frozen=True)
 class Trials:
-    """Settings of the fits that decide. oversample: wave samples a pixel where others are divided out; steps: of the
-    calculation, one for each fit."""
+    """Settings of the fits that decide. oversample: wave samples a pixel where others are divided out; run: whose
+    step each fit is."""
 
     train: Scan
     rest: Rest
@@ -59,7 +59,7 @@ class Trials:
     oversample: int
     seed: int = 0
     light: Light | None = None
-    steps: Steps = field(default_factory=Steps)
+    run: Run = field(default_factory=Run)
 
     def begun(self, frames: Scan, start: MovingSurfaces) -> Tried:
         """A stiff fit of `start` to `frames`."""
@@ -70,7 +70,7 @@ class Trials:
         return self._fitted(frames, tried.bodies, trial_of(self.soft, SOFT_STEPS))
 
     def _fitted(self, frames: Scan, start: MovingSurfaces, how: MotionFit) -> Tried:
-        def run() -> tuple[torch.Tensor, torch.Tensor]:
+        def tried() -> tuple[torch.Tensor, torch.Tensor]:
             fit = motion_fit(frames, start, how, self.seed, self.light, self.rest)
             fit.run(lambda record: None)
             found = fit.result().object
@@ -78,7 +78,7 @@ class Trials:
             left = Score.of(torch.from_numpy(frames.frames - predicted(frames, found, self.oversample)))
             return torch.from_numpy(left.powers), found.coefficients.detach()
 
-        powers, coefficients = self.steps.of(run)
+        powers, coefficients = self.run.step("twins", tried)
         left = Score(powers.numpy(), len(frames))
         return Tried(left, start.with_parameters({"coefficients": coefficients}))
 

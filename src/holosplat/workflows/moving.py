@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 from ..checks import require
 from ..fit.residuals import Prediction
+from ..fit.run import Run
 from ..matter import KnownSeveral, MaterialPrior
 from ..methods import Task
 from ..methods.assumed import assumed_material
 from ..methods.illumination import prepared
-from ..motion.flow_reconstruction import NOWHERE, FlowOptions, FlowSearch, merged
+from ..motion.flow_reconstruction import FlowOptions, FlowSearch, merged
 from ..optics.background import LightOptions
 from ..optics.sampling import fringe_sampling
 from ..progress import FitProgress
@@ -21,7 +22,7 @@ from .choice import Choice
 from .preconditions import check_frames, goes_on
 from .provenance import environment
 from .reconstruction import Assumptions, Reconstruction, config_of, write_run
-from .run_folder import Checkpoint, RunFolder
+from .run_folder import RunFolder
 from .run_illumination import light_options_of
 from .verdict import judge
 
@@ -79,15 +80,13 @@ def reconstruct_moving(
     task = prepared(Task(train, prior, seed, lambda stage, part: on_progress(stage, part, {}), assumed))
     mean = merged(task.scan)
     material = assumed_material(mean, task.prior, task.on_progress)
-    search = FlowSearch(task, material, options, NOWHERE if folder is None else Checkpoint(folder))
-    if going:
-        search.take_up()
-    elif ask and not search.moves(search.by_itself(mean, "mean of all times")):
+    search = FlowSearch(task, material, options, Run(folder))
+    if not going and ask and not search.moves(search.by_itself(mean, "mean of all times")):
         return None
     if folder is not None and not going:
         folder.begin(config | environment("cpu"))
-        search.keep()
-    found = search.run()
+        search.run.keep()
+    found = search.solve()
     oversample = fringe_sampling(train.exposures)
     said = Prediction(found.object, task.scan.exposures, oversample)
     decisions = (*task.decisions, *found.decisions)

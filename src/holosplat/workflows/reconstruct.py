@@ -13,7 +13,7 @@ from ..align.geometry import Geometry
 from ..align.poses import PoseOptions
 from ..backends import in_main_memory, resolve
 from ..checks import as_written, positive, require
-from ..fit.running import Record, Running
+from ..fit.run import Record, Running
 from ..inference import Decision
 from ..io.json import write_json
 from ..io.light import read_still_light

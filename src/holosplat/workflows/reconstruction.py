@@ -14,7 +14,7 @@ from ..backends import device_name
 from ..bodies.rest_shape import KnownBody
 from ..checks import as_written, require
 from ..display import card, of_object
-from ..fit.running import Running
+from ..fit.run import Running
 from ..geometry import Grid
 from ..io.json import read_json
 from ..io.light import write_light

@@ -16,9 +16,11 @@ from ..matter import KnownSeveral, MaterialPrior
 from ..methods import Task
 from ..methods.assumed import assumed_material
 from ..methods.illumination import prepared
+from ..motion.body_tracker import Followed, require_times
 from ..motion.elastic import Rest, strain_energy
 from ..motion.measures import columns, measured, row, standard_errors
-from ..motion.track import NOWHERE, USUAL, Followed, TrackOptions, follow, require_times
+from ..motion.track import USUAL, follow
+from ..motion.track_options import TrackOptions
 from ..optics.background import LightOptions
 from ..progress import FitProgress
 from ..representations import MovingSurfaces
@@ -28,7 +30,7 @@ from .choice import Choice
 from .preconditions import check_frames, goes_on
 from .provenance import environment
 from .reconstruction import Assumptions, Reconstruction, config_of, write_rest, write_run
-from .run_folder import Checkpoint, RunFolder, claimed
+from .run_folder import RunFolder, claimed
 from .run_illumination import light_options_of
 from .verdict import judge
 
@@ -98,8 +100,7 @@ def track(
         task = prepared(Task(scan.train(), prior, seed, lambda stage, part: on_progress(stage, part, {}), assumed))
         train = task.scan
         material = assumed_material(train.at_instant(0), task.prior, task.on_progress)
-        journal = NOWHERE if folder is None else Checkpoint(folder)
-        found = follow(train, material, options, seed, light=task.uneven, journal=journal, on_progress=on_progress)
+        found = follow(train, material, options, seed, light=task.uneven, journal=folder, on_progress=on_progress)
         said = Prediction(found.bodies, train.exposures, found.oversample)
         done = Reconstruction(
             found.bodies,
