@@ -7,12 +7,16 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from numbers import Real
 from pathlib import Path
 from types import FrameType
 from typing import Any, Protocol
 
-from ..checks import as_written
+import torch
+
+from ..checks import as_written, require
 from ..model import Model
+from ..tables import shown
 
 CHECKPOINT_SECONDS = 20.0
 """Time between two checkpoints of a fit, or of a stage of several steps [s]."""
@@ -176,8 +180,8 @@ class Run:
         return self.done[-1 if chain else number]
 
     def end_stage(self) -> None:
-        """Keep the state after a stage; the results of its steps are no longer needed."""
-        self.done, self._taken = [], 0
+        """Keep the state after a stage; its fit and the results of its steps are no longer needed."""
+        self.done, self._taken, self._fit = [], 0, None
         self.keep()
 
     @contextmanager
@@ -189,28 +193,35 @@ class Run:
         others = sum(self.timing.values()) - before
         self.timing[name] = self.timing.get(name, 0.0) + time.perf_counter() - began - others
 
-    def fit(self, name: str, fit: Running, show: Callable[[Record], None] = lambda record: None) -> None:
-        """Run a fit to its end, from where an earlier run was cut off in it, with checkpoints.
+    def fit(self, name: str, fit: Running, show: Callable[[Record], None] = lambda record: None) -> bool:
+        """Run a fit to its end, from where an earlier run was cut off in it, with checkpoints; whether it has ended.
 
         show: called with each record. Ctrl-C is passed on after the state is kept.
         """
-        if self._begun is not None:
-            with self.as_written():
-                fit.load(dict(self._begun))
-            self._begun = None
+        self.take_up(fit)
         self._fit = fit
 
-        def shown(record: Record) -> None:
+        def look(record: Record) -> None:
             show(record)
             if record["step"] == fit.step and self._is_due:  # on a GPU, records come late and in batches
                 self.keep()
 
         try:
             with self._kept_if_interrupted():
-                fit.run(shown)
+                fit.run(look)
         finally:
             self.timing[name] = self.timing.get(name, 0.0) + fit.seconds
-        self._fit = None
+        return fit.finished
+
+    def take_up(self, fit: Running) -> bool:
+        """Bring the fit in which an earlier run was cut off to where it was; whether `fit` is that one."""
+        if self._begun is None:
+            return False
+        with self.as_written():
+            require_alike(self._begun, fit.state_dict())
+            fit.load(dict(self._begun))
+        self._begun = None
+        return True
 
     def keep(self) -> None:
         """Write a checkpoint."""
@@ -236,6 +247,19 @@ class Run:
             raise
         finally:
             self._inside = outer
+
+
+def require_alike(saved: Any, own: Any, name: str = "") -> None:
+    """`InputError` where a saved state has a value of another kind than a fit's `own` at its beginning: a text for a
+    number, or a number for a table. What one of them lacks is left to the fit, as are lists."""
+    if saved is None or own is None:
+        return
+    kinds = (Mapping, torch.Tensor, str, Real)
+    kind = next((kind for kind in kinds if isinstance(own, kind)), object)
+    require(isinstance(saved, kind), f"{name or 'the state'} must be like {shown(own)}, but it is {shown(saved)}.")
+    if isinstance(own, Mapping):
+        for key in own.keys() & saved.keys():
+            require_alike(saved[key], own[key], str(key))
 
 
 class _Part:
