@@ -19,9 +19,9 @@ from holosplat.methods import SmoothVolume
 from holosplat.motion.flow_reconstruction import FlowOptions
 from holosplat.optics.background import LightOptions
 from holosplat.representations import MovingGaussians, SpaceTimeField
-from holosplat.workflows.moving import reconstruct_moving
 from holosplat.workflows.reconstruct import load_reconstruction
 from holosplat.workflows.run_folder import RunFolder
+from holosplat.workflows.track import reconstruct_moving
 
 pytestmark = pytest.mark.usefixtures("unjudged_runs")
 

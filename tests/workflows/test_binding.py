@@ -23,7 +23,7 @@ from holosplat.io.objects import write_object
 from holosplat.materials import parse_material
 from holosplat.matter import MaterialPrior, Matter
 from holosplat.representations import VoxelGrid
-from holosplat.workflows.binding import CONFIG_SUM, RESUMED_WITH, RUN, config_sum
+from holosplat.workflows.provenance import CONFIG_SUM, RESUMED_WITH, RUN, config_sum
 from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
 from holosplat.workflows.run_folder import RunFolder
 

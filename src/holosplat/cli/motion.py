@@ -19,9 +19,9 @@ from ..planning.acts import of_motion
 from ..report.run import report_run
 from ..scan import Scan
 from ..workflows.evaluate import evaluate as score
-from ..workflows.moving import begun_in_motion, reconstruct_moving
 from ..workflows.reconstruction import Reconstruction, reconstruction_at
 from ..workflows.run_folder import RunFolder
+from ..workflows.track import begun_in_motion, reconstruct_moving
 from .progress import INTERRUPTED, ProgressBar
 from .room import tell_frames
 

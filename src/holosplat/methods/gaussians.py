@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 import torch
 
-from ..backends import Backend, resolve
+from ..backends import resolve
 from ..baselines.beyond import rows_of
 from ..fit.density import DensityEvent
 from ..fit.loop import Fit, Plan
@@ -27,15 +27,13 @@ from ..representations import GaussianCloud, Stored, SurfaceMesh
 from ..scan import Scan
 from .coarse import STAGE as COARSE
 from .coarse import CoarseToFine, Way, coarse_surfaces, last_steps
-from .coarse_cloud import cloud_of_surfaces
-from .field import field_of
 from .first_surfaces import first_surfaces
 from .gaussian_options import FitOptions, GaussianOptions, GaussianRates
 from .ground import Ground, ground
 from .learned import guessed_start, ways_of_guess
 from .method import Method, Near, Stage, Task, run_quietly
-from .start import starting_cloud
-from .surface_fit import SurfaceFit, SurfaceOptions, oversampling
+from .start import cloud_of_surfaces, starting_cloud
+from .surface_fit import SurfaceFit, SurfaceOptions, field_of, oversampling
 
 
 @dataclass(frozen=True)
@@ -58,6 +56,7 @@ class Gaussians(GaussianOptions, Method):
     """
 
     kind: ClassVar[str] = "gaussians"
+    any_backend: ClassVar[bool] = True
 
     def stages(self) -> tuple[Stage, ...]:
         """One: the start, and the fit."""
@@ -73,11 +72,6 @@ class Gaussians(GaussianOptions, Method):
         """Whether it matters to these options whether matter has levels."""
         weights = self.fit.objective
         return self.start != "random" or weights.overfull > 0 or weights.two_levels > 0
-
-    def on_backend(self, backend: Backend) -> Gaussians:
-        """The same method computed by `backend`, the start, too."""
-        volume = replace(self.volume, backend=backend)
-        return replace(self, fit=replace(self.fit, backend=backend), volume=volume)
 
     def with_effort(self, effort: float) -> Gaussians:
         """The same method with `effort` times the steps, at least one."""

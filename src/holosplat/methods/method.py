@@ -9,6 +9,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol, Self, runtime_checkable
 import numpy as np
 import torch
 
+from ..backends import Backend
 from ..baselines.material import MaterialEstimate
 from ..checks import require
 from ..fit.pose_refinement import PoseRefinement, with_alignment
@@ -23,6 +24,7 @@ from ..optics.retrieval import absorption_alone
 from ..progress import Advance, Progress
 from ..representations import KINDS, Stored
 from ..scan import Scan
+from ..tables import with_entries
 from .first_volumes import FirstVolumes
 from .keeper import Keeper, Unseen, placed_at, where
 from .window import windows_of
@@ -177,12 +179,14 @@ class Method(Protocol):
 
     of_series: whether it takes all times of a scan at once; all others take frames of one time
     mixes_kinds: whether states of different kinds of Objects compete for its result
+    any_backend: whether GPUs can compute it, too
     likelier: whether fits are likelier than their starts by noise and prior; frames alone prefer what fits their noise
     """
 
     kind: ClassVar[str]
     of_series: ClassVar[bool] = False
     mixes_kinds: ClassVar[bool] = False
+    any_backend: ClassVar[bool] = False
     likelier: ClassVar[bool] = False
 
     @property
@@ -197,6 +201,11 @@ class Method(Protocol):
     def with_effort(self, effort: float) -> Self:
         """The same method with `effort` times the steps, at least one; one without steps is the same."""
         return self
+
+    def on_backend(self, backend: Backend) -> Self:
+        """The same method computed by `backend`, its start, too. Errors: `InputError` for one that takes no other."""
+        require(self.any_backend, f"the method {self.kind} runs on the CPU only; leave --backend.")
+        return with_entries(self, {"backend": backend})
 
     def require_files(self) -> None:
         """Read the files that the method names, so that one that is missing or damaged is refused before any work.

@@ -43,14 +43,6 @@ SECOND_STAGE = 1_000_003
 """Added to the seed for the stage through the waves."""
 
 
-def _objective() -> Objective:
-    return Objective(l1=0.0, spectral=1.0, floor=0.1)
-
-
-def _schedule() -> Schedule:
-    return Schedule(steps=250, views_per_step=1, decay=0.05)
-
-
 @dataclass(frozen=True)
 @ranged
 class NeuralFit:
@@ -80,9 +72,9 @@ class NeuralFit:
     """Steps between updates of where the field is looked at (0: never)."""
     empty: Weight = 0.1
     """Value up to which nothing is there, in these updates."""
-    objective: Objective = field(default_factory=_objective)
+    objective: Objective = field(default_factory=lambda: Objective(l1=0.0, spectral=1.0, floor=0.1))
     """How frames are compared."""
-    schedule: Schedule = field(default_factory=_schedule)
+    schedule: Schedule = field(default_factory=lambda: Schedule(steps=250, views_per_step=1, decay=0.05))
     """Of the stage through the waves; `seconds` is the limit of both stages together, half of it each."""
     terms: tuple[ExtraTerm, ...] = ()
     """Further terms by name, through the waves."""
@@ -101,6 +93,7 @@ class NeuralFields(Method):
     """A neural field that learns the line integrals of `HolographicTV`, and is then fitted to the frames."""
 
     kind: ClassVar[str] = "neural-field"
+    any_backend: ClassVar[bool] = True
 
     volume: HolographicTV = field(default_factory=HolographicTV)
     fit: NeuralFit = field(default_factory=NeuralFit)
@@ -108,11 +101,6 @@ class NeuralFields(Method):
     def stages(self) -> Sequence[Stage]:
         """The start, and the field, which learns the start's thickness before its fit."""
         return (HolographicStage(self.volume), NeuralStage(self.fit))
-
-    def on_backend(self, backend: Backend) -> NeuralFields:
-        """The same method computed by `backend`, the start, too."""
-        volume = replace(self.volume, backend=backend)
-        return replace(self, fit=replace(self.fit, backend=backend), volume=volume)
 
     def with_effort(self, effort: float) -> NeuralFields:
         """The same method with `effort` times the steps, at least one."""

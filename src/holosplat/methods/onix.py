@@ -37,14 +37,6 @@ from .neural_field import visual_hull
 from .volume import binning
 
 
-def _objective() -> Objective:
-    return Objective(l1=0.0, spectral=1.0, floor=0.1)
-
-
-def _schedule() -> Schedule:
-    return Schedule(steps=80, decay=0.1)
-
-
 @dataclass(frozen=True)
 @ranged
 class AlignedFit:
@@ -68,9 +60,9 @@ class AlignedFit:
     """Pixels around that."""
     max_voxels: Natural = 3_000_000
     """Frames are binned for the field rather than having more voxels than this: 144 pixels across."""
-    objective: Objective = field(default_factory=_objective)
+    objective: Objective = field(default_factory=lambda: Objective(l1=0.0, spectral=1.0, floor=0.1))
     """How frames are compared."""
-    schedule: Schedule = field(default_factory=_schedule)
+    schedule: Schedule = field(default_factory=lambda: Schedule(steps=80, decay=0.1))
     """Of the fit; no steps leave what the network guesses."""
     terms: tuple[ExtraTerm, ...] = ()
     """Further terms by name."""

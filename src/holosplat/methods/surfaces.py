@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import ClassVar
 
-from ..backends import Backend, resolve
+from ..backends import resolve
 from ..checks import InputError, require
 from ..fit.loop import Fit
 from ..inference import Score, select
@@ -46,6 +46,7 @@ class Surfaces(SurfaceOptions, Method):
     """
 
     kind: ClassVar[str] = "surfaces"
+    any_backend: ClassVar[bool] = True
 
     gaussians: Gaussians = field(default_factory=Gaussians)
 
@@ -57,10 +58,6 @@ class Surfaces(SurfaceOptions, Method):
     def require_files(self) -> None:
         """Those of the Gaussians."""
         self.gaussians.require_files()
-
-    def on_backend(self, backend: Backend) -> Surfaces:
-        """The same method computed by `backend`."""
-        return replace(self, gaussians=self.gaussians.on_backend(backend), fit=replace(self.fit, backend=backend))
 
     def with_effort(self, effort: float) -> Surfaces:
         """The same method with `effort` times the steps, at least one."""

@@ -8,7 +8,6 @@ from typing import ClassVar
 
 import torch
 
-from ..backends import Backend
 from ..baselines import HolographicTV, holographic_tv
 from ..baselines.beyond import rows_of
 from ..checks import at_least, require
@@ -40,16 +39,13 @@ class HolographicVoxels(Method):
     """Phase retrieval and total variation, made to agree with the holograms: the start of the Gaussians, by itself."""
 
     kind: ClassVar[str] = "holographic-tv"
+    any_backend: ClassVar[bool] = True
 
     volume: HolographicTV = field(default_factory=HolographicTV)
 
     def stages(self) -> tuple[Stage, ...]:
         """One, without a fit."""
         return (HolographicStage(self.volume),)
-
-    def on_backend(self, backend: Backend) -> HolographicVoxels:
-        """The same method computed by `backend`."""
-        return replace(self, volume=replace(self.volume, backend=backend))
 
 
 @dataclass(frozen=True)
@@ -68,10 +64,6 @@ class HolographicStage:
 
     def fit(self, task: Task, start: Stored) -> None:
         """Nothing is fitted."""
-
-
-def _objective() -> Objective:
-    return Objective(l1=0.0, spectral=1.0, floor=0.1)
 
 
 @dataclass(frozen=True)
@@ -95,7 +87,7 @@ class VoxelFit:
     """Voxels along a pixel's edge (0: as the first fringe needs)."""
     max_voxels: int = 20_000_000
     """Coarser voxels rather than more than this many."""
-    objective: Objective = field(default_factory=_objective)
+    objective: Objective = field(default_factory=lambda: Objective(l1=0.0, spectral=1.0, floor=0.1))
     """How frames are compared."""
     schedule: Schedule = field(default_factory=Schedule)
     """The loop's options but for the number of steps, which is above; all frames are looked at in every step."""

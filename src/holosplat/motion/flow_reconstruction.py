@@ -12,7 +12,7 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -55,6 +55,8 @@ FEWEST_PIXELS = 24
 @ranged
 class FlowOptions:
     """How matter in motion is reconstructed."""
+
+    kind: ClassVar[str] = "carried"
 
     volume: SmoothVolume = field(default_factory=SmoothVolume)
     """The volume of a time by itself, and of all times as if nothing moved."""

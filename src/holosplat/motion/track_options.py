@@ -15,14 +15,6 @@ from .pieces import PathOptions
 from .track_linking import LinkOptions
 
 
-def _stiff() -> MotionFit:
-    return MotionFit(rate=0.4, stiffness=100.0, schedule=Schedule(steps=60, views_per_step=16))
-
-
-def _half() -> MotionFit:
-    return MotionFit(rate=0.1, schedule=Schedule(steps=40, views_per_step=16))
-
-
 @dataclass(frozen=True)
 @ranged
 class TrackOptions:
@@ -48,7 +40,9 @@ class TrackOptions:
     """How often bodies are looked for beside those that are known, at most."""
     fainter: Share = 0.6
     """Factor of the level there: few views smear a body, and beside what is known there is little to take it for."""
-    stiff: MotionFit = field(default_factory=_stiff)
+    stiff: MotionFit = field(
+        default_factory=lambda: MotionFit(rate=0.4, stiffness=100.0, schedule=Schedule(steps=60, views_per_step=16))
+    )
     """The first fit, in which bodies move and turn nearly as a whole."""
     soft: MotionFit = field(default_factory=converged)
     """The second one, in which they deform."""
@@ -57,7 +51,7 @@ class TrackOptions:
     """Whether to compare bodies of known shape with others that have the same shadows in two beams."""
     intervals: bool = True
     """Whether halves of the frames are fitted, too, for standard errors: up to four short fits."""
-    half: MotionFit = field(default_factory=_half)
+    half: MotionFit = field(default_factory=lambda: MotionFit(rate=0.1, schedule=Schedule(steps=40, views_per_step=16)))
     """The fit to a half, from the result: errors are hundredths of a pixel. By Adam: halves that L-BFGS fits to the end
     agree on what both have from a known shape (two beams at 24°: volumes off by five standard errors). Where few beams
     see bodies of unknown shape, halves begin apart and are fitted as all frames are, softly: short fits leave them so

@@ -19,7 +19,7 @@ from ..methods.uncertain import Uncertain
 from ..optics.background import LightOptions
 from ..scan import Scan
 from ..tables import to_table
-from .binding import RESUMED_WITH
+from .provenance import RESUMED_WITH
 from .run_folder import OBJECT_SUM, RunFolder
 
 

@@ -27,8 +27,6 @@ from ..optics.sampling import fringe_sampling
 from ..progress import FitProgress, FitState
 from ..ranges import require_plausible
 from ..scan import Scan
-from ..tables import to_table
-from .choice import Choice
 from .preconditions import (
     check_frames,
     decided_before,
@@ -38,7 +36,7 @@ from .preconditions import (
     require_one_time,
 )
 from .provenance import environment, scan_hash
-from .reconstruction import Assumptions, Reconstruction, config_of, read_rest, write_run
+from .reconstruction import Choice, Reconstruction, config_of, read_rest, write_run
 from .refine import (
     freedom_of,
     keep_geometry,
@@ -104,8 +102,7 @@ def reconstruct(
     if not resume:  # a run that goes on may be past them
         method.require_files()
     assumed, ranges, planned = light or LightOptions(), uncertain or Uncertain(), scan
-    asked = Assumptions(assumed, ranges, refine)
-    config = config_of(scan, prior, to_table(method), seed, matter or "auto", asked)
+    config = config_of(scan, prior, method, seed, matter or "auto", assumed, uncertain=ranges, refine=refine)
 
     def tell(stage: str, part: float) -> None:
         on_progress(stage, part, {})
@@ -221,7 +218,7 @@ class _FolderRun(Run):
                 write_guess(self.folder.guess, self._guess.volume, self._guess.spread, self._guess.of_copies)
 
     def fit(self, name: str, fit: Running, show: Callable[[Record], None] = lambda record: None) -> bool:
-        """Run a fit, or what is left of it, and keep metrics and checkpoints up to date; whether it came to its end."""
+        """Run a fit, or the rest of it, with metrics and checkpoints; whether it came to its end."""
         again = self.take_up(fit)
         self.make_folder(fit.backend)
         if self.folder is not None:

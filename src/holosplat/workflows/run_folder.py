@@ -20,8 +20,7 @@ from ..io.lock import sole_writer
 from ..io.provenance import sha256
 from ..io.run_scan import read_marks
 from ..ranges import require_plausible
-from .binding import CONFIG_SUM, RUN, config_sum, require_bound
-from .manifest import write_manifest
+from .provenance import CONFIG_SUM, RUN, config_sum, require_bound, write_manifest
 
 if TYPE_CHECKING:
     from ..representations import Stored
