@@ -18,10 +18,10 @@ from holosplat.fit.schedule import Schedule
 from holosplat.geometry import rotation_y
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.matter import Matter
-from holosplat.motion import two_view_ambiguity
+from holosplat.motion import known
 from holosplat.motion.elastic import Elastic, Rest
 from holosplat.motion.fit import MotionFit
-from holosplat.motion.two_view_ambiguity import Trials, chosen_twins, in_question, twinned, without_details
+from holosplat.motion.known import Trials, chosen_twins, in_question, twinned, without_details
 from holosplat.representations import MovingSurfaces, TimeBasis
 
 PIXEL, SHAPE = 1e-6, (29, 35)
@@ -116,7 +116,7 @@ def test_frames_tell_a_body_from_its_twin(monkeypatch):
     told = [*trials.run.done]
     assert len(told) >= 4  # a stiff and a soft fit of a body and of its twin
     with monkeypatch.context() as none:
-        none.setattr(two_view_ambiguity, "motion_fit", lambda *given: pytest.fail("this fit was made before"))
+        none.setattr(known, "motion_fit", lambda *given: pytest.fail("this fit was made before"))
         again, _ = chosen_twins(twinned(truth, 0, ACROSS), replace(trials, run=Run(done=told)))
     assert torch.equal(again.coefficients, found.coefficients)
     assert chosen_twins(truth, replace(trials, run=Run()))[0] is truth

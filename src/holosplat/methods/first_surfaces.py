@@ -9,7 +9,6 @@ from itertools import combinations
 
 from torch import Tensor
 
-from ..backends import resolve
 from ..baselines import holographic_tv
 from ..checks import InputError, require
 from ..geometry import Grid
@@ -18,12 +17,11 @@ from ..matter import Matter
 from ..optics.noise import noise_share
 from ..representations import GaussianCloud, SurfaceMesh, VoxelGrid
 from .coarse import Way, settled, unexplained
-from .cross_validation import predicted_frames
 from .gaussian_options import GaussianOptions
 from .keeper import BY
 from .method import Task
 from .sharp_level import material_of_levels
-from .surface_fit import SurfaceOptions, cut_surfaces, extract_surfaces, oversampling
+from .surface_fit import SurfaceOptions, cut_surfaces, extract_surfaces, frames_of
 from .turns import cut_as_seen, in_turns
 from .volume import SmoothStage, SmoothVolume
 
@@ -134,9 +132,7 @@ def surfaces_of_levels(task: Task, options: GaussianOptions, surfaces: SurfaceOp
     require(len(found) > 0, "the volume holds no surface of the known materials.")
 
     def scored(name: str, fold: int) -> Score:
-        there = found[name].on(resolve(surfaces.fit.backend))
-        predicted = predicted_frames(task.scan.exposures, there, oversampling(task.scan, surfaces.fit))
-        return Score.of(task.scan.left(predicted.double()))
+        return Score.of(task.scan.left(frames_of(found[name], task.scan, surfaces.fit).double()))
 
     decision = select(NAME, tuple(found), scored, by=BY)
     task.on_start(decision, None)

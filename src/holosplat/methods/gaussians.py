@@ -75,8 +75,7 @@ class Gaussians(GaussianOptions, Method):
 
     def with_effort(self, effort: float) -> Gaussians:
         """The same method with `effort` times the steps, at least one."""
-        steps, first = (max(1, round(effort * n)) for n in (self.fit.schedule.steps, self.approximate_steps))
-        schedule = replace(self.fit.schedule, steps=steps)
+        first, schedule = max(1, round(effort * self.approximate_steps)), self.fit.schedule.with_effort(effort)
         coarse, fit = self.coarse.with_effort(effort), replace(self.fit, schedule=schedule)
         return replace(self, approximate_steps=first, fit=fit, coarse=coarse)
 
@@ -144,9 +143,7 @@ class GaussianStage:
         fit, schedule = self.options.fit, self.options.fit.schedule
         short = replace(fit, schedule=replace(schedule, steps=min(steps, schedule.steps), validation_views=0))
         run = GaussianStage(replace(self.options, fit=short)).fit(replace(task, near=False, freedom=None), cloud)
-        found = run_quietly(run, task.report(self.name))
-        assert isinstance(found, GaussianCloud)
-        return found
+        return run_quietly(run, task.report(self.name), GaussianCloud)
 
     def fit(self, task: Task, start: Stored) -> Fit:
         """The fit of the cloud to the training frames."""
@@ -180,9 +177,7 @@ class GaussianStage:
         """The cloud fitted to the frames of `task`."""
         start = self.own_start(task)
         assert isinstance(start, GaussianCloud)
-        found = run_quietly(self.fit(task, start), task.report(f"{COARSE}: Gaussians"))
-        assert isinstance(found, GaussianCloud)
-        return found
+        return run_quietly(self.fit(task, start), task.report(f"{COARSE}: Gaussians"), GaussianCloud)
 
 
 def resolved(options: FitOptions, task: Task, matter: Matter) -> FitOptions:

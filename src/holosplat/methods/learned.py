@@ -310,9 +310,7 @@ def _settled(task: Task, start: SurfaceMesh, steps: int) -> SurfaceMesh:
     """Surfaces after so many steps."""
     fit = SurfaceFit()
     fit = replace(fit, schedule=replace(fit.schedule, steps=steps), backend=start.backend)
-    found = run_quietly(surface_fit(task.scan, start, fit, task.seed, task.uneven), task.report(STAGE))
-    assert isinstance(found, SurfaceMesh)
-    return found
+    return run_quietly(surface_fit(task.scan, start, fit, task.seed, task.uneven), task.report(STAGE), SurfaceMesh)
 
 
 def _cut(task: Task, cloud: GaussianCloud, surfaces: SurfaceOptions) -> SurfaceMesh | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, NamedTuple, Protocol, Self, runtime_checkable
+from typing import Any, ClassVar, NamedTuple, Protocol, Self, TypeVar, runtime_checkable
 
 import numpy as np
 import torch
@@ -227,10 +227,15 @@ def finished(fit: Running) -> Stored:
     return found.on(fit.backend)
 
 
-def run_quietly(fit: Running, report: Advance) -> Stored:
-    """Run a fit to its end without keeping records; what it ended with. Ctrl-C is passed on."""
+Kind = TypeVar("Kind")
+
+
+def run_quietly(fit: Running, report: Advance, kind: type[Kind]) -> Kind:
+    """Run a fit to its end without keeping records; the object of this kind that it ended with. Ctrl-C is passed on."""
     fit.run(lambda record: report(fit.share))
-    return finished(fit)
+    found = finished(fit)
+    assert isinstance(found, kind)
+    return found
 
 
 class Look(Protocol):

@@ -21,7 +21,6 @@ from ..fit.run import Record
 from ..fit.schedule import Schedule
 from ..fit.terms import Objective
 from ..fit.terms.field import FieldVariation, RetrievedThickness
-from ..fit.terms.frames import SpectralMisfit
 from ..geometry import Grid, Poses, Views
 from ..matter import Matter
 from ..model import Model
@@ -104,8 +103,7 @@ class NeuralFields(Method):
 
     def with_effort(self, effort: float) -> NeuralFields:
         """The same method with `effort` times the steps, at least one."""
-        first, steps = (max(1, round(effort * n)) for n in (self.fit.warmup_steps, self.fit.schedule.steps))
-        schedule = replace(self.fit.schedule, steps=steps)
+        first, schedule = max(1, round(effort * self.fit.warmup_steps)), self.fit.schedule.with_effort(effort)
         return replace(self, fit=replace(self.fit, warmup_steps=first, schedule=schedule))
 
 
@@ -147,9 +145,7 @@ def warmed_up(task: Task, matter: Matter, thickness: Tensor, options: NeuralFit)
     if options.warmup_steps == 0:
         return field
     fit = _warm_up(task.scan, field, (thickness / field.pitch).float(), options, task.seed)
-    found = run_quietly(fit, task.report(WARM_UP))
-    assert isinstance(found, NeuralField)
-    return found
+    return run_quietly(fit, task.report(WARM_UP), NeuralField)
 
 
 def _warm_up(scan: Scan, field: NeuralField, target: Tensor, options: NeuralFit, seed: int) -> Fit:
@@ -161,7 +157,7 @@ def _warm_up(scan: Scan, field: NeuralField, target: Tensor, options: NeuralFit,
     base = ground(scan, field.on(backend), field.matter, options.objective, schedule, backend)
     terms = (
         RetrievedThickness(target.to(generator.device), scan.views, share, generator),
-        FieldVariation(_weight(base.frames.spectral, options), options.probes, generator),
+        FieldVariation(base.in_noise(options.weight, options.noise_weight), options.probes, generator),
     )
     return Fit(_plan(Problem(base.model, terms), schedule, options, generator), seed)
 
@@ -173,15 +169,11 @@ def waves_fit(scan: Scan, field: NeuralField, options: NeuralFit, seed: int = 0,
     drawn = field.on(backend)
     drawn.jitter = generator
     base = ground(scan, drawn, field.matter, options.objective, options.schedule, backend, light=light)
-    weight = _weight(base.frames.spectral, options) / len(base.train)
+    weight = base.in_noise(options.weight, options.noise_weight) / len(base.train)
     variation = FieldVariation(weight, options.probes, generator)
     problem = Problem(base.model, (base.frames, variation, *base.extra(options.terms)))
     plan = _plan(problem, options.schedule, options, generator)
     return Fit(replace(plan, judge=base.judge), seed)
-
-
-def _weight(spectral: SpectralMisfit | None, options: NeuralFit) -> float:
-    return options.weight + options.noise_weight * (0.0 if spectral is None else spectral.noise)
 
 
 def _plan(problem: Problem, schedule: Schedule, options: NeuralFit, generator: torch.Generator) -> Plan:

@@ -162,8 +162,7 @@ class Waves(GoesOn):
         base = _ground(task, start, options, schedule)
         generator = torch.Generator().manual_seed(task.seed + SECOND_STAGE)
         times, views = base.train.instants, _views(base)
-        spectral = base.frames.spectral
-        weight = options.weight + options.noise_weight * (0.0 if spectral is None else spectral.noise)
+        weight = base.in_noise(options.weight, options.noise_weight)
         terms: list[Term] = [
             base.frames,
             SpaceTimeVariation(weight / views, options.smoothing, times.tolist(), generator),

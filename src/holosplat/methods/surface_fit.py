@@ -33,6 +33,7 @@ from ..ranges import Rate, Weight, ranged
 from ..representations import GaussianCloud, SurfaceMesh, isosurface
 from ..representations.isosurface import adjacency, edge_lengths, neighbour_mean
 from ..scan import Scan
+from .cross_validation import predicted_frames
 from .ground import ExtraTerm, ground
 
 VERTICES = "object.vertices"
@@ -94,8 +95,7 @@ class SurfaceOptions:
 
     def with_effort(self, effort: float) -> Self:
         """The same options with `effort` times the steps, at least one."""
-        schedule = replace(self.fit.schedule, steps=max(1, round(effort * self.fit.schedule.steps)))
-        return replace(self, fit=replace(self.fit, schedule=schedule))
+        return replace(self, fit=replace(self.fit, schedule=self.fit.schedule.with_effort(effort)))
 
 
 def extract_surfaces(cloud: GaussianCloud, scan: Scan, options: Extraction = Extraction()) -> SurfaceMesh:
@@ -225,6 +225,11 @@ def _membrane_on_gpu(start: SurfaceMesh, stiffness: float) -> Callable[[Tensor],
     """The same on the GPU, which does not wait for the CPU."""
     edges = adjacency(start.faces.cpu().numpy(), len(start.vertices))
     return membrane_inverse(edges, stiffness, device(start.backend))
+
+
+def frames_of(found: SurfaceMesh | GaussianCloud, scan: Scan, options: SurfaceFit) -> Tensor:
+    """Frames [V, H, W] of `scan` that `found` predicts, as a fit of surfaces predicts them."""
+    return predicted_frames(scan.exposures, found.on(resolve(options.backend)), oversampling(scan, options))
 
 
 def field_of(cloud: GaussianCloud, views: Views) -> Views:

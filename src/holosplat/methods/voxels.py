@@ -180,9 +180,7 @@ def voxel_fit(
     refine = max(1, round(scan.views.finest / start.grid.voxel_size[0]))
     schedule = replace(options.schedule, steps=options.steps)
     base = ground(scan, start, start.matter, options.objective, schedule, "cpu", finer=refine, light=light)
-    spectral = base.frames.spectral
-    noise = 0.0 if spectral is None else spectral.noise
-    weight = (options.weight + options.noise_weight * noise) / (refine**2 * len(base.train))
+    weight = base.in_noise(options.weight, options.noise_weight) / (refine**2 * len(base.train))
     scale = torch.tensor([1.0, ABSORPTION_REACH][: len(start.matter)])[:, None, None, None]
     upper = options.upper if options.upper and start.matter.single else float("inf")
 

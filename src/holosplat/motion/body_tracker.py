@@ -35,12 +35,11 @@ from .detections import (
 )
 from .elastic import Rest
 from .fit import MotionFit, motion_fit
-from .known import KnownBodies, at_rest
+from .known import KnownBodies, Trials, at_rest, chosen_twins
 from .measures import astray, halves_of, tell_shapes
 from .pieces import chosen_paths
 from .track_linking import first_paths
 from .track_options import TrackOptions
-from .two_view_ambiguity import Trials, chosen_twins
 
 STAGES = ("sightings", "first paths", "stiff", "beside", "paths", "soft", "twins", "soft again", "halves", "done")
 """In about their order: stiff fits and looks beside their bodies take turns."""

@@ -60,8 +60,5 @@ class TrackOptions:
     def with_effort(self, effort: float) -> TrackOptions:
         """The same with `effort` times the steps, at least one."""
         parts = {name: getattr(self, name) for name in ("stiff", "soft", "half")}
-        changed = {
-            name: replace(part, schedule=replace(part.schedule, steps=max(1, round(effort * part.schedule.steps))))
-            for name, part in parts.items()
-        }
+        changed = {name: replace(part, schedule=part.schedule.with_effort(effort)) for name, part in parts.items()}
         return replace(self, **changed)
