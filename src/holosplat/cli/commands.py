@@ -152,7 +152,7 @@ def reconstruct(
 
 def _time_by_time(scan: Path, out: Path, asked: Asked, reading: Reading, seed: int, resume: bool) -> None:
     """Bodies followed through all times, or a run for each time."""
-    from .motion import reconstruct_each
+    from .each_time import reconstruct_each
     from .track import track
 
     method = asked.how.chosen()

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from ..checks import require
 from ..io.formats import read_frames
 from ..io.reading import Reading
 from ..io.run_scan import run_source
@@ -20,18 +18,12 @@ from ..optics.background import LightOptions
 from ..planning.acts import of_motion
 from ..report.run import report_run
 from ..scan import Scan
-from ..series.collect import collect
-from ..series.folder import SeriesFolder, line_of
-from ..series.plan import Cut, Settings, plan_series
-from ..series.run import run_left
 from ..workflows.evaluate import evaluate as score
 from ..workflows.reconstruction import Reconstruction, reconstruction_at
 from ..workflows.run_folder import RunFolder
 from ..workflows.track import begun_in_motion, reconstruct_moving
 from .progress import INTERRUPTED, ProgressBar
-from .room import tell_each_time, tell_frames
-from .sentence import say
-from .series import UNFINISHED
+from .room import tell_frames
 
 FEWEST_TIMES = 3
 """Times from which on matter in motion can be found."""
@@ -107,40 +99,3 @@ def report_of_middle(folder: RunFolder, result: Reconstruction, measured: Scan) 
     now = reconstruction_at(result, times, middle)
     whole = f"This is the time {1e6 * times[middle]:.4g} µs, of {len(measured)} frames of {len(times)} times in all."
     return report_run(folder, now, shown, score(now, shown, None), None, whole)
-
-
-def reconstruct_each(
-    scan: Path,
-    out: Path,
-    settings: Settings,
-    prior: Callable[[float], MaterialPrior],
-    reading: Reading,
-    resume: bool,
-) -> None:
-    """Make the series of all times of `scan` in the folder `out`, in this process, and its table and page.
-
-    It is what `series plan`, `run` and `collect` make of it, as one task. resume: go on with a folder that was begun.
-    Errors: `InputError` for a folder that is not of this, and what `plan_series` refuses.
-    """
-    reading = replace(reading, part=replace(reading.part, time_frame=None))
-    every = plan_series([scan], settings, prior, reading, Cut())
-    planned = replace(every, cut=Cut(window=len(every.moments())))
-    seen, method, matter = read_frames(scan, reading), settings.method, settings.matter
-    tell_each_time(seen.exposures[~seen.is_test], out, method, matter)
-    folder = SeriesFolder(out)
-    if resume and out.exists():
-        require(
-            folder.plan() == planned,
-            f"{out} must be of the same scan and options to go on, but is not; leave --resume, choose another --out.",
-        )
-    else:
-        folder.create(planned)
-    try:
-        counts = run_left(folder, retry=True, on_row=lambda row: say(line_of(row)))
-    except KeyboardInterrupt:
-        say(f"interrupted; go on with --out {out} --resume")
-        raise SystemExit(INTERRUPTED) from None
-    collect(folder)
-    say(f"wrote {folder.table}, {folder.page}; each time is a run folder in {folder.task(0)}")
-    if counts.failed or counts.left:
-        raise SystemExit(UNFINISHED)
