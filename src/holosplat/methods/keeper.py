@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, cast
@@ -79,7 +78,7 @@ class Keeper:
         if self._judge is None:
             self._judge = MissingMatter(self.train, _material(self.best.object if self.best else found))
         state = State.of(name, found, oversample, self.train.exposures)
-        self.judged[name] = math.sqrt(self._judge.squares(self.train.left(state.predicted))[0])
+        self.judged[name] = self._judge.share(state.predicted)
         if self._wins(state, fitted):
             self.best = state
 
