@@ -113,9 +113,10 @@ HOLO_EXPORT int64_t holosplat_voxelise_backward(const HoloCloud*, const HoloGrid
 // q <- projection of q + step * gradient(u) onto the ball of `radius`, voxel by voxel
 HOLO_EXPORT int64_t holosplat_tv_ascend(const HoloGrid*, const float* u, float* q, double step, double radius,
                                         int64_t threads);
-// u <- clamp(u - tau (slope + coupling * adjoint_gradient(q)), 0, upper); extrapolated <- 2 u_new - u_old
+// u <- clamp(u - tau (slope + coupling * adjoint_gradient(q)), lower, upper); extrapolated <- 2 u_new - u_old
 HOLO_EXPORT int64_t holosplat_tv_descend(const HoloGrid*, const float* slope, const float* tau, const float* q,
-                                         double coupling, double upper, float* u, float* extrapolated, int64_t threads);
+                                         double coupling, double lower, double upper, float* u, float* extrapolated,
+                                         int64_t threads);
 // value <- sum over voxels with three forward neighbours of sqrt(|gradient(u)|^2 + smoothing^2) - smoothing;
 // gradient [Z, Y, X] <- its derivative
 HOLO_EXPORT int64_t holosplat_tv_smooth(const HoloGrid*, const float* u, double smoothing, float* gradient,

@@ -30,10 +30,10 @@ void ascend_row(int64_t n, const float* u, const float* down, const float* side,
 }
 
 struct Step {
-  float coupling, upper;
+  float coupling, lower, upper;
 };
 
-// One row of the primal variable: u - tau (slope + coupling * adjoint gradient of q), clamped to [0, upper],
+// One row of the primal variable: u - tau (slope + coupling * adjoint gradient of q), clamped to [lower, upper],
 // and its extrapolation 2 new - old. `above` and `before` are the neighbouring rows of q0 and q1, null at the border.
 void descend_row(int64_t n, const float* slope, const float* tau, const float* q0, const float* above, const float* q1,
                  const float* before, const float* q2, const Step& step, float* u, float* extrapolated) {
@@ -41,7 +41,7 @@ void descend_row(int64_t n, const float* slope, const float* tau, const float* q
     const float inflow = (above ? above[i] : 0.0f) + (before ? before[i] : 0.0f) + last;
     const float divergence = inflow - q0[i] - q1[i] - q2[i];
     const float moved = u[i] - tau[i] * (slope[i] + step.coupling * divergence);
-    const float fresh = std::min(std::max(moved, 0.0f), step.upper);
+    const float fresh = std::min(std::max(moved, step.lower), step.upper);
     extrapolated[i] = 2 * fresh - u[i];
     u[i] = fresh;
   };
@@ -66,10 +66,10 @@ int64_t holosplat_tv_ascend(const HoloGrid* grid, const float* u, float* q, doub
 }
 
 int64_t holosplat_tv_descend(const HoloGrid* grid, const float* slope, const float* tau, const float* q,
-                             double coupling, double upper, float* u, float* extrapolated, int64_t threads) {
+                             double coupling, double lower, double upper, float* u, float* extrapolated, int64_t threads) {
   return holo::guarded([&] {
     const int64_t ny = grid->height, nx = grid->width, plane = ny * nx, all = grid->depth * plane;
-    const Step step{static_cast<float>(coupling), static_cast<float>(upper)};
+    const Step step{static_cast<float>(coupling), static_cast<float>(lower), static_cast<float>(upper)};
     holo::parallel(grid->depth, threads, [&](int64_t z) {
       for (int64_t y = 0; y < ny; ++y) {
         const int64_t at = z * plane + y * nx;

@@ -174,6 +174,8 @@ class MaterialPrior:
     """The known materials, that of the stronger contrast (the larger |δ|) first."""
     sign: Sign = 0
     """1 where δ of the matter lies above its medium's, -1 where it lies below, 0 where that is not known."""
+    two_sided: bool = False
+    """Whether δ of continuous matter may lie on both sides of its medium's."""
     medium: str = ""
     """Name of the medium, as it was given."""
 
@@ -212,10 +214,21 @@ class MaterialPrior:
         """The same knowledge with a sign of δ, where that was not known."""
         return self
 
+    def on_both_sides(self) -> MaterialPrior:
+        """The same knowledge of continuous matter on both sides of its medium. Errors: `InputError` for several
+        materials."""
+        raise InputError(
+            "matter on both sides of its medium must be of one --material, but there are several; give one."
+        )
+
+    def with_ratio(self, ratio: float) -> MaterialPrior:
+        """What is known of one material whose δ/β was found."""
+        return KnownRatio(float(ratio), self.sign, self.two_sided)
+
     @property
     def against(self) -> str:
         """What δ and β are differences to, in words; empty for vacuum, and where nothing is said."""
-        return self.medium or ("the medium" if self.sign < 0 else "")
+        return self.medium or ("the medium" if self.sign < 0 or self.two_sided else "")
 
     @property
     def delta_sign(self) -> float:
@@ -239,7 +252,7 @@ class MaterialPrior:
     def as_dict(self) -> dict[str, Any]:
         """Plain values, ready for JSON, as config.json holds them."""
         first = self.materials[0] if self.materials else DeltaBeta(0.0, 0.0)
-        told = {"sign": 0 if self.materials else self.sign, "medium": self.medium}
+        told = {"sign": 0 if self.materials else self.sign, "medium": self.medium, "two_sided": self.two_sided}
         plain = {"kind": self.kind, "delta": first.delta, "beta": first.beta, "ratio": 0.0}
         return plain | {name: value for name, value in told.items() if value}
 
@@ -250,6 +263,7 @@ class Known(MaterialPrior):
 
     material: DeltaBeta
     medium: str = field(default="", compare=False)
+    two_sided: bool = False
     kind = "known"
 
     def __post_init__(self) -> None:
@@ -264,6 +278,10 @@ class Known(MaterialPrior):
     def sign(self) -> Sign:  # type: ignore[override]
         """That of the material's δ."""
         return -1 if self.material.delta < 0 else 1
+
+    def on_both_sides(self) -> MaterialPrior:
+        """The same of matter on both sides."""
+        return replace(self, two_sided=True)
 
 
 @dataclass(frozen=True)
@@ -306,6 +324,7 @@ class KnownRatio(MaterialPrior):
 
     ratio: Signed
     sign: Annotated[Sign, Within(-1, 1)] = 0
+    two_sided: bool = False
     kind = "ratio"
 
     def __post_init__(self) -> None:
@@ -323,12 +342,17 @@ class KnownRatio(MaterialPrior):
         """The same with that sign."""
         return replace(self, sign=sign)
 
+    def on_both_sides(self) -> MaterialPrior:
+        """The same of matter on both sides."""
+        return replace(self, two_sided=True)
+
 
 @dataclass(frozen=True)
 class Unknown(MaterialPrior):
     """Nothing is known of the matter, but perhaps the sign of δ."""
 
     sign: Sign = 0
+    two_sided: bool = False
     kind = "free"
 
     @property
@@ -339,6 +363,10 @@ class Unknown(MaterialPrior):
     def signed(self, sign: Sign) -> MaterialPrior:
         """The same with that sign."""
         return replace(self, sign=sign)
+
+    def on_both_sides(self) -> MaterialPrior:
+        """The same of matter on both sides."""
+        return replace(self, two_sided=True)
 
 
 def _require_contrast(material: DeltaBeta) -> None:

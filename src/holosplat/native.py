@@ -17,7 +17,7 @@ from pathlib import Path
 
 from .checks import MissingError
 
-ABI = 7
+ABI = 8
 ISAS = ("sse2", "avx2", "avx512")
 """Builds for x86-64, slowest first. Other processors have one build, `generic`."""
 
@@ -175,7 +175,7 @@ _FUNCTIONS = {
     "holosplat_adam": (POINTER(Adam), c_void_p, c_int64),
     "holosplat_tv_smooth": (POINTER(Grid), c_void_p, c_double, c_void_p, c_void_p, c_int64),
     "holosplat_tv_ascend": (POINTER(Grid), c_void_p, c_void_p, c_double, c_double, c_int64),
-    "holosplat_tv_descend": (POINTER(Grid), *(c_void_p,) * 3, c_double, c_double, *(c_void_p,) * 2, c_int64),
+    "holosplat_tv_descend": (POINTER(Grid), *(c_void_p,) * 3, *(c_double,) * 3, *(c_void_p,) * 2, c_int64),
 }
 
 

@@ -142,5 +142,5 @@ def test_a_solver_goes_on_from_a_coarser_one():
     for solver in (warm, PrimalDual(fine, start, 0.4, 1.0, 0.25)):
         solver.run(images, 10)
         errors.append(float((solver.volume - end.volume).norm() / end.volume.norm()))
-    assert warm.upper == 1.0
+    assert warm.bounds == (0.0, 1.0)
     assert errors[0] < 0.9 * errors[1]

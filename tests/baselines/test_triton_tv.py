@@ -51,16 +51,16 @@ def test_nothing_varies_where_there_is_nothing(steps, gpu):
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("upper", [0.7, math.inf])
-def test_descent_equals_its_float64_twin(steps, gpu, shape, upper):
+@pytest.mark.parametrize("bounds", [(0.0, 0.7), (0.0, math.inf), (-0.4, 0.7), (-math.inf, math.inf)])
+def test_descent_equals_its_float64_twin(steps, gpu, shape, bounds):
     u, slope, tau = (randoms(*shape, seed=seed).float().to(gpu) for seed in (2, 3, 4))
     tau, q, ahead = 0.1 + tau.abs(), dual(shape, gpu), torch.empty_like(u)
     want, want_ahead = u.double(), torch.empty_like(u, dtype=torch.float64)
-    reference.descend(slope.double(), tau.double(), q.double(), 0.3, upper, want, want_ahead)
-    steps.descend(slope, tau, q, 0.3, upper, u, ahead)
+    reference.descend(slope.double(), tau.double(), q.double(), 0.3, bounds, want, want_ahead)
+    steps.descend(slope, tau, q, 0.3, bounds, u, ahead)
     assert float((u - want).abs().max()) < 2e-6
     assert float((ahead - want_ahead).abs().max()) < 4e-6
-    assert float(u.min()) == 0
+    assert float(u.min()) == pytest.approx(max(bounds[0], float(want.min())), abs=1e-5)
 
 
 @pytest.mark.parametrize(

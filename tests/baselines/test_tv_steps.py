@@ -56,9 +56,9 @@ def test_ascent_equals_its_float64_twin(shape, threads, steps):
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("upper", [0.7, float("inf")])
+@pytest.mark.parametrize("bounds", [(0.0, 0.7), (0.0, float("inf")), (-0.4, 0.7), (float("-inf"), float("inf"))])
 @pytest.mark.parametrize("steps", [cpu, reference])
-def test_descent_equals_its_float64_twin(shape, upper, steps):
+def test_descent_equals_its_float64_twin(shape, bounds, steps):
     u, slope = (randoms(*shape, seed=s, dtype=torch.float32) for s in (2, 3))
     tau, q = (
         0.1 + randoms(*shape, seed=4, dtype=torch.float32).abs(),
@@ -67,11 +67,11 @@ def test_descent_equals_its_float64_twin(shape, upper, steps):
     old, wide = u.double().numpy().copy(), torch.empty_like(u)
     q[0, -1] = q[1, :, -1] = q[2, :, :, -1] = 0  # as ascent keeps them: there is no voxel beyond the last
     a, b, c = (t.double().numpy() for t in (slope, tau, q))
-    want = np.clip(old - b * (a + 0.3 * gradient_adjoint(c)), 0, upper)
-    steps.descend(slope, tau, q, 0.3, upper, u, wide)
+    want = np.clip(old - b * (a + 0.3 * gradient_adjoint(c)), *bounds)
+    steps.descend(slope, tau, q, 0.3, bounds, u, wide)
     assert np.abs(u.numpy() - want).max() < 1e-6
     assert np.abs(wide.numpy() - (2 * want - old)).max() < 2e-6
-    assert float(u.min()) == 0
+    assert float(u.min()) == pytest.approx(max(bounds[0], want.min()))
 
 
 def test_the_twins_are_adjoint():

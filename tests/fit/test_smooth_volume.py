@@ -77,6 +77,8 @@ def test_the_descent_never_rises_and_keeps_matter_positive():
 class Trap:
     """Σ (u - 1)² (u + 0.05): a second, higher minimum at zero, where a first step from far above ends."""
 
+    lower = 0.0
+
     def __call__(self, u: torch.Tensor) -> tuple[float, torch.Tensor]:
         return float(((u - 1) ** 2 * (u + 0.05)).sum()), 2 * (u - 1) * (u + 0.05) + (u - 1) ** 2
 

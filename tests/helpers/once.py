@@ -22,12 +22,12 @@ from holosplat.geometry import Grid
 from holosplat.inference import Decision
 from holosplat.matter import DeltaBeta
 from holosplat.methods import Task
-from holosplat.methods.contrast import BELOW, Scoring, decide_sign, with_sign
+from holosplat.methods.contrast import BELOW, BOTH, Scoring, both_sides, decide_sides, decide_sign, with_sign
 from holosplat.methods.first_volumes import FirstVolumes
 from holosplat.methods.illumination import decided
 from holosplat.methods.levels import decide_matter
 from holosplat.methods.sharp_level import material_of_levels
-from holosplat.optics.background import Light
+from holosplat.optics.background import Light, LightOptions
 from holosplat.progress import Progress
 from holosplat.scan import Scan
 from holosplat.workflows.provenance import scan_hash
@@ -90,6 +90,15 @@ def once(memory: Once) -> Iterator[None]:
         prior = with_sign(first.prior, made)
         return (first if above else FirstVolumes(first.folds, prior, first.on_progress, first.options)), made
 
+    def sides(first: FirstVolumes, how: LightOptions) -> Any:
+        key = ("sides", *of(first.folds.scan), first.prior, first.taken, how)
+
+        def compute(told: Progress) -> Decision:
+            return decide_sides(replace(first, on_progress=told), how)[1]
+
+        made = memory.answer(key, compute, first.on_progress)
+        return (both_sides(first) if made.choice == BOTH else first), made
+
     def ratio(scan: Scan, on_progress: Progress, *how: Any) -> float:
         return memory.answer(("ratio", *of(scan), *how), lambda told: estimate_ratio(scan, told, *how), on_progress)
 
@@ -118,6 +127,7 @@ def once(memory: Once) -> Iterator[None]:
         "solve.decide_matter": decide,
         "illumination.decided": light,
         "illumination.decide_sign": sign,
+        "illumination.decide_sides": sides,
         "assumed.estimate_ratio": ratio,
         "assumed.estimate_delta": delta,
         "start.material_of_levels": level,

@@ -122,7 +122,7 @@ def operations(every_size: bool) -> list[Callable[[], None]]:
     def vary() -> None:
         u, q = torch.ones(3, 4, 5), torch.ones(3, 3, 4, 5)
         total_variation.ascend(u, q, 0.5, 1.0)
-        total_variation.descend(u, u, q, 1.0, 1.0, u, u)
+        total_variation.descend(u, u, q, 1.0, (0.0, 1.0), u, u)
 
     def lattice() -> None:
         poses = (torch.ones(2, 3, 3, dtype=torch.float64), torch.ones(2, 2, dtype=torch.float64))

@@ -43,6 +43,21 @@ def test_noise_of_each_frame_is_no_pattern(grain: float):
     assert float(fixed_pattern(measured, matter).std()) < 0.15 * NOISE
 
 
+def test_errors_that_go_with_the_shadow_of_matter_on_the_axis_are_no_pattern():
+    """A cylinder there casts one shadow in all frames, and what its volume gets wrong is alike in all of them, too."""
+    measured, _, _, true = frames()
+    x = torch.arange(SHAPE[1]).double() - 23.5
+    shadow = torch.exp(-0.2 * torch.exp(-0.5 * (x / 4) ** 2)).expand(len(measured), *SHAPE)
+    own = true * (1 + NOISE * torch.from_numpy(np.random.default_rng(5).standard_normal(measured.shape)))
+    wrong = 1 + 0.1 * (shadow[0] - 1)
+    found = fixed_pattern(shadow * wrong * own, shadow)
+    beside, within = x.abs() > 12, x.abs() < 3
+    left = (found / true).log()
+    assert float(left[:, beside].std()) < 0.8 * PATTERN
+    taken = float(found[:, within].log().mean() - found[:, beside].log().mean())
+    assert abs(taken) < 0.5 * abs(float(wrong[:, within].log().mean()))
+
+
 def test_one_frame_has_no_pattern():
     measured, matter, *_ = frames(count=1)
     assert bool((fixed_pattern(measured, matter) == 1).all())

@@ -40,7 +40,7 @@ def rows_beyond(volume: Tensor, scan: Scan, ratio: float) -> int:
     noise = 2 * float(noise_levels(scan.measured).square().mean())
     slopes = frames.diff(dim=2).square().mean(dim=(0, 2)) - noise
     chance = noise * math.sqrt(3 / (OUTER * len(frames) * frames.shape[2]))  # 3: neighbouring slopes share a pixel
-    for rows, part, doubt in ((volume.mean(dim=(0, 2)), LEAVING, 0.0), (slopes, FINE, SURE * chance)):
+    for rows, part, doubt in ((volume.abs().mean(dim=(0, 2)), LEAVING, 0.0), (slopes, FINE, SURE * chance)):
         outer = max(float(rows[:OUTER].mean()), float(rows[-OUTER:].mean()))
         if outer <= part * float(rows.mean()) + doubt:
             return 0

@@ -79,6 +79,9 @@ class HolographicTV:
     """Coarser voxels rather than more than this many."""
     upper: Weight = 1.0
     """Bound of the occupancy (0: none)."""
+    two_sided: bool = False
+    """Whether the occupancy may be below zero, of matter on both sides of its medium; a run takes what is known of the
+    matter, or decided."""
     still_light: int = 0
     """Half waves across a frame up to which light that is the same in all frames, such as what a missing flat field has
     left, is unknown and found beside the matter (0: there is none). Its mean is taken to be right, for in few views it
@@ -90,7 +93,8 @@ class HolographicTV:
     inside: Metres = 0.0
     """Distance from the axis within which matter lies [m], such as the inner radius of a tube (0: anywhere)."""
     beyond: bool = True
-    """Whether a volume without a bound has rows above and below the frames where matter goes on there."""
+    """Whether a volume without a bound has rows of its own above and below the frames where matter goes on there; else
+    it goes on as in its outermost ones."""
     backend: Backend = "auto"
     """What computes it."""
 
@@ -136,7 +140,9 @@ def retrieved(
     """Thickness [V, H, W] of `material` [m], which phase retrieval finds in every view by itself; leaves: whether
     matter goes on above and below the frames."""
     backend, noise = resolve(options.backend), correlated(light)
-    how = Tikhonov(iterations=options.retrieval, backend=backend, leaves=leaves, noise=noise)
+    how = Tikhonov(
+        iterations=options.retrieval, backend=backend, leaves=leaves, noise=noise, two_sided=options.two_sided
+    )
     known = {"options": how, "missing": scan.gaps, "on_progress": partial(on_progress, "phase retrieval")}
     return tikhonov(torch.from_numpy(scan.frames), scan.exposures, *material, **known)
 
@@ -159,7 +165,8 @@ def agreed(
         projector = projector_for(Grid.of_views(views), views, options.backend)
         there = start.to(device(options.backend))
         begun = PrimalDual(projector, there, options.weight, options.upper or None, backend=options.backend)
-        volume, grid = _agree(scan, material, begun, options, 1, on_progress, light)
+        beyond = _leaving(begun.volume, scan, material, options)
+        volume, grid = _agree(scan, material, begun, options, 1, on_progress, light, beyond)
         return volume.cpu(), grid
 
 
@@ -180,11 +187,21 @@ def _holographic_tv(
     else:
         scan, light, solver = _settled(scan, material, options, on_progress, light)
     alone = absorption_alone(scan.exposures, material.beta / material.delta)  # then retrieval left nothing to correct
-    volume, grid = solver.volume, Grid.of_views(_field(scan, solver))
-    none = options.corrections == 0 or options.still_light or noise > options.noisy or alone.all()
+    beyond = _leaving(solver.volume, scan, material, options)
+    field = _field(scan, solver).taller(beyond)
+    volume, grid = carried_on(solver.volume, beyond), Grid.of_views(field)
+    free = options.still_light or options.two_sided  # no bound holds what rounds add at low frequencies
+    none = options.corrections == 0 or free or noise > options.noisy or alone.all()
     if none or not wanted(volume.cpu(), grid):
         return volume, grid
-    return _agree(scan, material, solver, options, refine, on_progress, light)
+    return _agree(scan, material, solver, options, refine, on_progress, light, beyond)
+
+
+def _leaving(volume: Tensor, scan: Scan, material: DeltaBeta, options: HolographicTV) -> int:
+    """Rows above and below the frames into which a volume [Z, Y, X] that ends with them is carried on as it is in its
+    outermost ones, where matter goes on there: its waves would else have the fringes of an end."""
+    ends = volume.shape[1] == scan.views.shape[0] and options.still_light == 0
+    return rows_beyond(volume, scan, material.beta / material.delta) if ends else 0
 
 
 def _tomography(
@@ -198,7 +215,7 @@ def _tomography(
     """Phase retrieval of each view and total variation: the solver, on voxels of one pixel.
 
     Where its volume has matter at the top or at the bottom, both are done anew with matter beyond the frames; but not
-    where a bound says how much of it there is, for it is then right to a few rows without them.
+    where a bound says how much of it there is (`_leaving`).
     """
     if lines is None:
         lines = retrieved(scan, material, options, on_progress, light)
@@ -228,7 +245,7 @@ def _volume_of(
     gaps = None if gaps is None else carried_on(gaps.float(), beyond) > 0
     rays = rays_of(lines, field, Grid.of_views(field), options.backend, gaps)
     first = min(TotalVariation.first, options.iterations)
-    known = {"still_light": options.still_light, "misfit": options.misfit}
+    known = {"still_light": options.still_light, "misfit": options.misfit, "two_sided": options.two_sided}
     inside = options.inside / scan.views.finest
     steps = TotalVariation(first=first, iterations=options.iterations - first, inside=inside, **known)
     weights = photons_left(lines, scan.exposures, material)
@@ -273,8 +290,11 @@ def _agree(
     refine: int,
     on_progress: Progress,
     light: Light | None,
+    carried: int = 0,
 ) -> tuple[Tensor, Grid]:
     """The volume after rounds of agreement with the holograms, on voxels `refine` times finer than pixels.
+
+    It is `carried` on by so many rows of pixels above and below (`_leaving`).
 
     Each round runs the wave optics on the volume's projection, inverts what is missing from the frames, as far as
     their noise lets it be known (`Correction`), and gives the corrected projection to a few primal–dual steps. The
@@ -298,7 +318,8 @@ def _agree(
     for done in range(options.corrections + 1):
         on_progress("agreement with the holograms", done / options.corrections)
         lines = solver.lines()
-        predicted = frames_of(instrument, refined(lines, finer) * pitch, material).detach()
+        there = carried_on(refined(lines, finer), carried * refine * finer)
+        predicted = frames_of(instrument, there * pitch, material).detach()
         lit = predicted if beside is None else predicted * beside.factor(images=predicted)
         missing = frames - lit if gaps is None else (frames - lit).masked_fill(gaps, 0.0)
         misfit = float(missing.square().sum())
@@ -307,6 +328,7 @@ def _agree(
         if done < options.corrections:
             more = correction(missing)
             solver.run(lines + refined(more / pitch, refine), inner)
+    best, grid = carried_on(best, carried * refine), Grid.of_views(views.taller(carried), refine)
     return best, _in_metres(grid, pitch)
 
 

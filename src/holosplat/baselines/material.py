@@ -98,11 +98,13 @@ def estimate_delta(
     backend: Backend = "auto",
     options: MaterialEstimate = DEFAULT,
     sign: float = 1.0,
+    two_sided: bool = False,
 ) -> float:
-    """δ, of that `sign`, of the one material in `scan` with δ/β = `ratio`: the plateau of a non-negative tomography."""
+    """δ, of that `sign`, of the one material in `scan` with δ/β = `ratio`: the plateau of a non-negative tomography, or
+    of one that may have matter on both sides of its medium."""
     on_progress("estimate of delta", 0.0)
     coarse = scan.coarsened(max(1, round(scan.views.shape[1] / (2 * options.width))))
-    return plateau(_trial_volume(coarse, ratio, backend, options, sign)) * sign * TRIAL_DELTA
+    return plateau(_trial_volume(coarse, ratio, backend, options, sign, two_sided).abs()) * sign * TRIAL_DELTA
 
 
 def level_of(occupancy: Tensor) -> float:
@@ -119,11 +121,14 @@ def level_of(occupancy: Tensor) -> float:
     return plateau(occupancy * (occupancy >= values[int(between.argmax())]))
 
 
-def _trial_volume(scan: Scan, ratio: float, backend: Backend, options: MaterialEstimate, sign: float) -> Tensor:
-    """Occupancy by Paganin's retrieval and a little total variation, not negative and without an upper bound."""
+def _trial_volume(
+    scan: Scan, ratio: float, backend: Backend, options: MaterialEstimate, sign: float, two_sided: bool = False
+) -> Tensor:
+    """Occupancy by Paganin's retrieval and a little total variation without an upper bound; not negative, unless matter
+    is `two_sided`."""
     frames, delta, used = torch.from_numpy(scan.frames), sign * TRIAL_DELTA, resolve(backend)
     lines = paganin(frames, scan.exposures, delta, delta / ratio, missing=scan.gaps)
     rays = rays_of(lines, scan.views, Grid.of_views(scan.views), used, scan.gaps)
-    how = TotalVariation(weight=options.weight, first=options.iterations, iterations=0, per_level=False)
+    how = TotalVariation(options.weight, options.iterations, 0, per_level=False, two_sided=two_sided)
     with memory_kept():
         return tv_solver(rays, None, how, lambda fraction: None, used).volume.cpu()

@@ -42,11 +42,12 @@ class LinearProjector(Protocol):
 
 
 class PrimalDual:
-    """`min_u ½‖A u - b‖² + λ Σ|∇u|` with `0 ≤ u ≤ upper`, warm-started from call to call; float32.
+    """`min_u ½‖A u - b‖² + λ Σ|∇u|` with `lower ≤ u ≤ upper`, warm-started from call to call; float32.
 
     Chambolle & Pock (2011), algorithm 1, with the diagonal steps of Pock & Chambolle (2011), eq. 10 (α = 1).
     `coupling` scales the gradient operator against the projector and changes only how fast it converges.
-    Lengths are in voxels or pixels, as the projector has them; `upper=None` bounds from below only.
+    Lengths are in voxels or pixels, as the projector has them; `upper=None` bounds from below only, `lower=-inf` not at
+    all.
     """
 
     def __init__(
@@ -57,12 +58,13 @@ class PrimalDual:
         upper: float | None,
         coupling: float = 1.0,
         backend: str = "cpu",
+        lower: float = 0.0,
     ) -> None:
         self._backend = backend
         self._steps = implementation(f"{__package__}.tv_steps", backend)
         self.projector, self.coupling = projector, coupling
         self.radius = weight / coupling
-        self.upper = float("inf") if upper is None else upper
+        self.bounds = (lower, float("inf") if upper is None else upper)
         self._array = projector.volume_in(start).float().contiguous().clone()
         path = projector.project(torch.ones_like(self._array)).clamp_min(1e-3)
         self._dual_step = 1 / path
@@ -87,7 +89,7 @@ class PrimalDual:
     def on_finer(self, projector: LinearProjector, factor: int, weight: float) -> PrimalDual:
         """A solver on voxels and pixels `factor` times finer, those of `projector`, which goes on from this one.
 
-        It takes over the volume (interpolated), the bound, and the dual of total variation, without which its first
+        It takes over the volume (interpolated), the bounds, and the dual of total variation, without which its first
         iterations would blur what is there; the residuals' dual starts anew, and with all frequencies trusted alike.
         """
         volume, dual = self.volume, self._gradient_dual
@@ -95,8 +97,8 @@ class PrimalDual:
             volume = interpolate(volume[None, None], scale_factor=factor, mode="trilinear", align_corners=False)[0, 0]
             for axis in (1, 2, 3):
                 dual = dual.repeat_interleave(factor, axis)
-        upper = None if self.upper == float("inf") else self.upper
-        finer = PrimalDual(projector, volume, weight, upper, self.coupling / factor**2, self._backend)
+        lower, upper = self.bounds
+        finer = PrimalDual(projector, volume, weight, upper, self.coupling / factor**2, self._backend, lower)
         finer._gradient_dual.copy_(dual * factor**2)
         return finer
 
@@ -159,7 +161,7 @@ class PrimalDual:
         self._steps.ascend(self._extrapolated, self._gradient_dual, 0.5, self.radius)
         slope = self.projector.backproject(self._residual_dual)
         tau, arrays = self._primal_step, (self._array, self._extrapolated)
-        self._steps.descend(slope, tau, self._gradient_dual, self.coupling, self.upper, *arrays)
+        self._steps.descend(slope, tau, self._gradient_dual, self.coupling, self.bounds, *arrays)
         if self._inside is not None:
             for array in arrays:
                 array.mul_(self._inside)

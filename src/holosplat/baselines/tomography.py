@@ -71,7 +71,7 @@ class TotalVariation:
     that is the same in all views is unknown, but for its mean (0: it is even); misfit: weight of total variation as a
     multiple of the misfit (rms) of the first iterations, where that is more; inside: distance from the axis within
     which matter lies, in pixels (0: anywhere); per_level: whether, without an upper bound, the weight is per level of
-    the matter that is found.
+    the matter that is found; two_sided: whether the occupancy may be below zero.
     """
 
     weight: Weight = 0.5
@@ -82,6 +82,7 @@ class TotalVariation:
     misfit: Weight = 0.0
     inside: Metres = 0.0
     per_level: bool = True
+    two_sided: bool = False
 
 
 def total_variation(
@@ -123,7 +124,8 @@ def tv_solver(
     """
     like = rays.measured
     start, coupling = like.new_zeros(rays.grid.shape), 1 / rays.refine**2
-    solver = PrimalDual(rays.projector, start, options.weight, checked_upper(upper), coupling, backend)
+    lower = float("-inf") if options.two_sided else 0.0
+    solver = PrimalDual(rays.projector, start, options.weight, checked_upper(upper), coupling, backend, lower)
     if weights is not None:
         solver.weigh(weights.to(like))
     if options.inside > 0:
@@ -137,8 +139,8 @@ def tv_solver(
     for done in range(total):
         on_progress(done / total)
         images = solver.completed(measured, gaps)
-        if found and done % LEVEL_STEPS == 0 and bool((solver.volume > 0).any()):
-            level = plateau(solver.volume)
+        if found and done % LEVEL_STEPS == 0 and bool((solver.volume != 0).any()):
+            level = plateau(solver.volume.abs())
         if done == options.first and options.discount > 0 and not alike:
             spectrum = misfit_spectrum(rays, solver.lines() - images) / (level or 1.0) ** 2
             solver.discount(spectrum**options.discount)

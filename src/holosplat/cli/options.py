@@ -320,6 +320,9 @@ class PriorOptions:
     """The medium's density [g/cm³]."""
     delta_beta: Signed | str | None = None
     """Or: only the ratio δ/β of the one material is known, or a range LOW:HIGH of it (for `reconstruct`)."""
+    contrast: Literal["auto", "above", "below", "both"] = "auto"
+    """Side of the medium's δ on which matter lies: above, below, or both, of continuous matter such as a shock; auto:
+    by the material, or the frames decide."""
 
     def ranges(self) -> dict[str, tuple[float, float]]:
         """What is said as a range, by name."""
@@ -343,10 +346,25 @@ class PriorOptions:
             if isinstance(self.delta_beta, str):
                 said = f"it is {self.delta_beta!r}; a range is for reconstruct alone."
                 raise InputError(f"--delta-beta must be one number here, but {said}")
-            return MaterialPrior.unknown() if self.delta_beta is None else MaterialPrior.of_ratio(self.delta_beta)
+            free = MaterialPrior.unknown() if self.delta_beta is None else MaterialPrior.of_ratio(self.delta_beta)
+            return self._sided(free)
         around = (self.medium, self.medium_density)
         told = (MaterialOptions(*each, *around).filling().of("", energy_kev) for each in self._with_densities())
-        return MaterialPrior.known(*told, medium=self.medium or "")
+        return self._sided(MaterialPrior.known(*told, medium=self.medium or ""))
+
+    def _sided(self, prior: MaterialPrior) -> MaterialPrior:
+        """The prior with what `contrast` says."""
+        if self.contrast == "auto":
+            return prior
+        if self.contrast == "both":
+            return prior.on_both_sides()
+        sign = 1 if self.contrast == "above" else -1
+        require(
+            not prior.materials or prior.sign == sign,
+            f"--contrast must be on the side of --material, but it is {self.contrast}, and the material's δ lies on "
+            "the other side of its medium's; leave --contrast.",
+        )
+        return prior.signed(sign)
 
     def _with_densities(self) -> list[tuple[str, float | None]]:
         """Each material with the density that is given for it."""

@@ -30,6 +30,8 @@ class FlowProblem:
     (its own pixels may be larger).
     """
 
+    lower = 0.0
+
     def __init__(
         self,
         frames: Sequence[WhitenedFrames],

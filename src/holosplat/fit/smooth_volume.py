@@ -36,7 +36,8 @@ class ContinuousPrior:
     """The prior of matter: `a Σ log(1 + (√(|∇u|² + ε²) - ε) / b) + m Σ log(1 + d(u) / v)`.
 
     Slopes of few voxels are large, those of most are almost zero, and most of space is empty, or full of one of the
-    materials that are known: d is the distance to the nearest of these levels, one of which is 0, the medium.
+    materials that are known: d is the distance to the nearest of these levels, one of which is 0, the medium. u is not
+    negative, unless matter may lie on both sides of its medium.
     Logarithms, as of power laws, hardly shrink what is large, where total variation takes from every edge in proportion
     to its height (Nikolova 2005). As the misfit is in units of the noise, a and m have no unit, and hold for every
     noise.
@@ -54,6 +55,8 @@ class ContinuousPrior:
     """v: distance from the nearest level beyond which the law holds, as a share of the matter's level."""
     levels: tuple[float, ...] = ()
     """Occupancies of the known materials, rising from above 0; none where no density is known."""
+    two_sided: bool = False
+    """Whether u may be negative."""
 
     def __post_init__(self) -> None:
         for name in ("slope", "rounding", "value"):
@@ -70,21 +73,22 @@ class ContinuousPrior:
         return replace(self, **steeper, values=factor**2 * self.values)
 
     def distance(self, u: Tensor, epsilon: float) -> tuple[Tensor, Tensor]:
-        """How far u ≥ 0 is from the nearest level, and the slope of that; within `epsilon` of a known one a square."""
-        if not self.levels:
+        """How far u is from the nearest level, and the slope of that; within `epsilon` of one a square, but for 0 where
+        u ≥ 0."""
+        if not (self.levels or self.two_sided):
             return u, torch.ones_like(u)
         levels = u.new_tensor([0.0, *self.levels])
-        away = u - levels[torch.bucketize(u, 0.5 * (levels[1:] + levels[:-1]))]
+        away = u - levels[torch.bucketize(u, 0.5 * (levels[1:] + levels[:-1]))]  # of one level all are in one bucket
         size = (away.square() + epsilon**2).sqrt()
         return size - epsilon, away / size
 
 
 class VolumeProblem:
-    """½ χ² of the frames and the prior of a volume u [Z, Y, X] ≥ 0 of one material's occupancy, on voxels of a pixel.
+    """½ χ² of the frames and the prior of a volume u [Z, Y, X] of one material's occupancy, on voxels of a pixel.
 
     The volume has the rows beyond the frames, too (`WhitenedFrames.field`).
-    level: what u is about in matter, the unit of the prior's slopes and values; support [Z, Y, X] bool: where matter
-    may be (None: anywhere), beyond which u must begin at zero, and stays there.
+    level: what u is about in matter, the unit of the prior's slopes and values; lower: what u is at least; support
+    [Z, Y, X] bool: where matter may be (None: anywhere), beyond which u must begin at zero, and stays there.
     """
 
     def __init__(
@@ -97,6 +101,7 @@ class VolumeProblem:
     ) -> None:
         require(level > 0, f"the level of the matter must be positive, but it is {level:g}.")
         self.frames, self.prior, self.level = frames, prior, level
+        self.lower = -math.inf if prior.two_sided else 0.0
         views = frames.field
         pixels = views.in_units_of(views.finest)
         self.grid = Grid.of_views(pixels)
@@ -148,7 +153,7 @@ class VolumeProblem:
         b, epsilon = self.prior.slope * self.level, self.prior.rounding * self.level
         size = _slopes(u, epsilon)
         pull = self.prior.slopes / ((b - epsilon + size) * size)
-        matter = u > MATTER * u.max()
+        matter = u.abs() > MATTER * u.abs().max()
         mean = float(pull[matter].mean()) if bool(matter.any()) else float(pull.mean())
         least = 1e-4 * mean + 1e-6 * float(self._symbol.max())
         inverse = 1 / (times * self._symbol + mean * self._laplacian + least)
@@ -179,7 +184,9 @@ def _slopes(u: Tensor, epsilon: float) -> Tensor:
 
 
 class Penalised(Protocol):
-    """What a `Descent` makes small."""
+    """What a `Descent` makes small; lower: what its volume is at least."""
+
+    lower: float
 
     def __call__(self, u: Tensor) -> tuple[float, Tensor]:
         """The objective and its gradient [Z, Y, X]."""
@@ -193,9 +200,9 @@ class Penalised(Protocol):
 class Descent:
     """Projected L-BFGS from `start` [Z, Y, X], an iteration at a time; the objective never rises.
 
-    Voxels at zero that the gradient would keep there are fixed, and the others take a step of L-BFGS among themselves,
-    cut off at zero (two-metric projection: Bertsekas 1982; Nocedal & Wright 2006, algorithm 7.4, for the step, with the
-    problem's preconditioner as first inverse).
+    Voxels at the lower bound that the gradient would keep there are fixed, and the others take a step of L-BFGS among
+    themselves, cut off there (two-metric projection: Bertsekas 1982; Nocedal & Wright 2006, algorithm 7.4, for the
+    step, with the problem's preconditioner as first inverse).
 
     u: the volume; value: its objective; done: how many iterations; ended: whether none lowers the objective further;
     kept: whether steps that would leave nothing are shortened, for an empty volume is a trap: there the prior of
@@ -203,7 +210,7 @@ class Descent:
     """
 
     def __init__(self, problem: Penalised, start: Tensor, kept: bool = False) -> None:
-        self.problem, self.u, self.kept = problem, start.clamp_min(0), kept
+        self.problem, self.u, self.kept = problem, start.clamp_min(problem.lower), kept
         self.value, self._gradient = problem(self.u)
         self.done, self.ended = 0, False
         self._pairs = list[tuple[Tensor, Tensor]]()
@@ -217,7 +224,7 @@ class Descent:
         if self.done and self.done % REFRESH == 0:
             self._conditioned(self.u)
         u, gradient = self.u, self._gradient
-        free = ((u > 0) | (gradient < 0)).to(u)
+        free = ((u > self.problem.lower) | (gradient < 0)).to(u)
         way = direction(gradient, self._pairs, self._inverse, free)
         found = self._searched(way)
         if found is None and self._pairs:
@@ -237,9 +244,9 @@ class Descent:
         """The first point of a shrinking series along the projected `way` that lowers the objective enough."""
         length, u, gradient = 1.0, self.u, self._gradient
         for _ in range(TRIALS):
-            moved = (u + length * way).clamp_min(0)
+            moved = (u + length * way).clamp_min(self.problem.lower)
             length *= SHRINK
-            if self.kept and not bool((moved > 0).any()):
+            if self.kept and not bool(moved.any()):
                 continue
             found, slope = self.problem(moved)
             if found <= self.value + SUFFICIENT * min(0.0, float((gradient * (moved - u)).sum())):

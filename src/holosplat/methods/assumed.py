@@ -26,5 +26,5 @@ def assumed_material(
         return DeltaBeta(deltas[0], deltas[0] * sum(betas) / sum(deltas)) if betas[1:] else prior.materials[0]
     how = (on_progress, backend, options, prior.delta_sign)
     ratio = prior.ratio if isinstance(prior, KnownRatio) else estimate_ratio(scan, *how)
-    delta = estimate_delta(scan, ratio, *how)
+    delta = estimate_delta(scan, ratio, *how, prior.two_sided)
     return DeltaBeta(delta, delta / ratio)

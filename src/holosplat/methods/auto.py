@@ -27,6 +27,7 @@ class Auto(Method):
     any_backend: ClassVar[bool] = True
     mixes_kinds: ClassVar[bool] = True
     """A volume may take the place of bodies."""
+    two_sided: ClassVar[bool] = True
 
     gaussians: Gaussians = field(default_factory=Gaussians)
     surfaces: SurfaceOptions = field(default_factory=SurfaceOptions)

@@ -1,22 +1,27 @@
 """On which side of its medium's the δ of matter lies: bodies in air or in a lighter medium, or holes in a denser one.
 
-The null is matter above its medium. Holes are taken where a volume of them predicts unseen frames better.
+The null is matter above its medium. Holes are taken where a volume of them predicts unseen frames better; matter on
+both sides, such as a shock and what is rarefied behind it, where this predicts them better than either.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import torch
 
+from ..baselines import HolographicTV
 from ..checks import InputError
 from ..inference import Decision, Score, select
 from ..matter import MaterialPrior
+from ..optics.background import LightOptions
 from .first_volumes import FirstVolumes
-from .trials import WITHOUT
+from .trials import WITHOUT, Trials, name_of
 
 STAGE = "sign of the contrast"
 ABOVE, BELOW = "δ above the medium's", "δ below the medium's"
+BOTH = "δ on both sides of the medium's"
 
 
 Scoring = Callable[[FirstVolumes, int, str], Score]
@@ -30,7 +35,7 @@ def decide_sign(first: FirstVolumes, *scores: Scoring) -> tuple[FirstVolumes, tu
     left the sign open. A sign under which no matter is found predicts even light, and a sign is sure only where its
     matter predicts frames better than none.
     """
-    if first.prior.sign:
+    if first.prior.sign or first.prior.two_sided:
         return first, ()
     first.on_progress(STAGE, 0.0)
     holes = FirstVolumes(first.folds, first.prior.signed(-1), first.on_progress, first.options)
@@ -42,8 +47,7 @@ def decide_sign(first: FirstVolumes, *scores: Scoring) -> tuple[FirstVolumes, tu
             try:
                 return score(volumes[sign], fold, without)
             except InputError:  # there is no such matter, or no such light
-                unseen = first.folds.split(fold)[1]
-                return Score.of(unseen.left(torch.ones(unseen.frames.shape, dtype=torch.float64)))
+                return _without_matter(first, fold)
 
         beside = {other: (other + WITHOUT,)}
         return select(STAGE, (null, other), scored, first.folds.count, by=first.folds.by, beside=beside)
@@ -55,9 +59,46 @@ def decide_sign(first: FirstVolumes, *scores: Scoring) -> tuple[FirstVolumes, tu
     return volumes[decision.choice], (decision,)
 
 
+def decide_sides(first: FirstVolumes, light: LightOptions) -> tuple[FirstVolumes, Decision]:
+    """The first volumes of matter on one side of its medium, or on both, and the decision between them.
+
+    Light makes up for matter that may not be there. So volumes of both sides, in even light, are compared with those of
+    one in the light that was taken beside them.
+    """
+    first.on_progress(STAGE, 0.0)
+    one = ABOVE if first.prior.delta_sign > 0 else BELOW
+    two = both_sides(first)
+    trials = {one: (Trials(first, light), name_of(first.taken)), BOTH: (Trials(two, light), name_of(()))}
+
+    def scored(name: str, fold: int) -> Score:
+        side, without, _ = name.partition(WITHOUT)
+        tried, taken = trials[side]
+        try:
+            return tried.score(taken + without, fold)
+        except InputError:  # there is no such matter
+            return _without_matter(first, fold)
+
+    by = first.folds.by
+    decision = select(STAGE, (one, BOTH), scored, first.folds.count, by=by, beside={BOTH: (BOTH + WITHOUT,)})
+    return (two if decision.choice == BOTH else first), decision
+
+
+def both_sides(first: FirstVolumes) -> FirstVolumes:
+    """The same of matter on both sides of its medium, with the usual steps, for no bound makes them end sooner."""
+    usual = HolographicTV()
+    how = replace(first.options, retrieval=usual.retrieval, iterations=usual.iterations)
+    return FirstVolumes(first.folds, first.prior.on_both_sides(), first.on_progress, how)
+
+
+def _without_matter(first: FirstVolumes, fold: int) -> Score:
+    unseen = first.folds.split(fold)[1]
+    return Score.of(unseen.left(torch.ones(unseen.frames.shape, dtype=torch.float64)))
+
+
 def with_sign(prior: MaterialPrior, decisions: Sequence[Decision]) -> MaterialPrior:
-    """`prior` with the sign that was decided for, if any was."""
+    """`prior` with the sign, or both, that was decided for last, if any was."""
     for each in decisions:
         if each.name == STAGE:
-            return prior.signed(-1 if each.choice == BELOW else 1)
+            both = each.choice == BOTH
+            prior = prior.on_both_sides() if both else prior.signed(-1 if each.choice == BELOW else 1)
     return prior

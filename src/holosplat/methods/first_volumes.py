@@ -117,6 +117,10 @@ class FirstVolumes:
             self._material = assumed_material(self.folds.scan, self.prior, self.on_progress, self.options.backend)
         return self._material
 
+    @property
+    def _how(self) -> HolographicTV:
+        return replace(self.options, two_sided=self.prior.two_sided)
+
     def once(self, key: object, fold: int, make: Callable[[], T]) -> T:
         """What `make` gives, made once for a key and a fold."""
         if (key, fold) not in self._made:
@@ -130,12 +134,12 @@ class FirstVolumes:
         plain = light.background is None and light.still is None and not light.noise.has_grain
         if plain and self.folds.by == BY_VIEWS:
             lines = self.once("thickness", 0, self._thickness)[self.folds.kept(fold)]
-        values, grid = holographic_tv(even, self.material, self.options, self.on_progress, light, lines=lines)
+        values, grid = holographic_tv(even, self.material, self._how, self.on_progress, light, lines=lines)
         return VoxelGrid(values[None], grid, Matter.one(*self.material)).on(resolve(self.options.backend))
 
     def _thickness(self) -> Tensor:
         """What phase retrieval finds in all coarse frames as they were measured, each by itself: folds share it."""
-        return retrieved(self.folds.scan, self.material, self.options, self.on_progress)
+        return retrieved(self.folds.scan, self.material, self._how, self.on_progress)
 
 
 def lit_by_halves(measured: Tensor, predicted: Tensor, known: Background) -> Tensor:

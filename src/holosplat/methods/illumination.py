@@ -25,7 +25,7 @@ from ..scan import Scan
 from .assumed import assumed_material
 from .auto import Auto
 from .contrast import STAGE as SIGN
-from .contrast import Scoring, decide_sign, with_sign
+from .contrast import Scoring, decide_sides, decide_sign, with_sign
 from .cross_validation import predicted_frames
 from .first_volumes import BY_FISSION, EFFORT, FirstVolumes
 from .levels import TrialFits
@@ -140,9 +140,16 @@ def prepared(task: Task, method: Method | None = None, before: Prepared | None =
     if before is None:
         task.on_progress(STAGE, 0.0)
         first.taken, made = decided(first, options, told, tuple(open_to))
+        if _may_have_both_sides(task, method, first):
+            first, sides = decide_sides(first, options)
+            task = replace(task, prior=with_sign(task.prior, (sides,)), decisions=(*task.decisions, sides))
+            if task.prior.two_sided:
+                first.taken, made = decided(first, options, told, tuple(open_to))
         shown = None if method is None or method.of_series or not made else shows_matter(first, options, first.taken)
         if isinstance(method, Auto) and shown is not None and shown.choice.endswith(WITHOUT):
-            scored = by_fits(task, first, method.with_effort(EFFORT).kinds)
+            kinds = method.with_effort(EFFORT).kinds
+            alone: dict[MatterKind, Method] = {"continuous": kinds["continuous"]}
+            scored = by_fits(task, first, alone if task.prior.two_sided else kinds)
             first.taken, again = decided(first, options, told, tuple(open_to), scored)
             made = (*made, shown, *again)
         elif method is not None and first.taken != told and not method.of_series:
@@ -155,6 +162,13 @@ def prepared(task: Task, method: Method | None = None, before: Prepared | None =
         first.taken, made = before[0], tuple(each for each in before[1] if each.name != SIGN)
     scan, light = _applied(task, light, first.taken)
     return replace(task, scan=scan, lit=light, decisions=(*task.decisions, *made), first=first)
+
+
+def _may_have_both_sides(task: Task, method: Method | None, first: FirstVolumes) -> bool:
+    """Whether matter may be on both sides of its medium: a known material is on one; and whether views can tell."""
+    told = bool(task.prior.materials) or task.prior.two_sided
+    can = method is not None and method.two_sided and not task.scan.is_series
+    return can and not told and first.folds.by != BY_FISSION
 
 
 def _scores(options: LightOptions) -> list[Scoring]:
@@ -177,7 +191,8 @@ def _applied(task: Task, light: Light, taken: Hypothesis) -> tuple[Scan, Light]:
         return replace(task.scan, frames=light.evened(frames).numpy().astype(np.float32))
 
     def predict(light: Light) -> Tensor:
-        return predicted_first(evened(light), task.prior, HolographicTV(upper=0.0), task.on_progress, light)
+        how = HolographicTV(upper=0.0, two_sided=task.prior.two_sided)
+        return predicted_first(evened(light), task.prior, how, task.on_progress, light)
 
     for one in order:
         if one != UNEVEN and task.scan.is_series:

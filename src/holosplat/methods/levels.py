@@ -19,7 +19,7 @@ from ..baselines.tomography import plateau
 from ..baselines.two_materials import best_levels, eroded, told_apart
 from ..checks import NoMatterError
 from ..inference import Decision, Score, select
-from ..matter import MaterialPrior, MatterKind
+from ..matter import MatterKind
 from ..representations import VoxelGrid
 from .first_volumes import BY_FISSION, FirstVolumes, predictions
 from .method import Method, Task, solve_stages
@@ -41,6 +41,8 @@ def decide_matter(task: Task, methods: Mapping[MatterKind, Method] | None = None
     bounds nothing; where flat volumes predict neither better nor worse, these are fitted. One ratio δ/β holds one
     level. Of views that are too few to set some aside, levels are taken.
     """
+    if task.prior.two_sided:
+        return Decision(NAME, CONTINUOUS, "matter lies on both sides of its medium")
     if len(task.prior.materials) > 1:
         return Decision(NAME, SEVERAL, "several materials are known")
     task.on_progress(STAGE, 0.0)
@@ -127,7 +129,7 @@ class TrialFits:
         if not (prior.fixes_ratio or two):
             known = task.lit is not None
             ratio = ratio_of_one(task, self._first).value if known else self._first.material.ratio
-            prior = MaterialPrior.of_ratio(ratio, prior.sign)
+            prior = prior.with_ratio(ratio)
         fitted = replace(task, scan=seen, prior=prior, lit=trial.light, matter=kind, first=None)
         try:
             return predictions(solve_stages(method, fitted), trial.unseen)

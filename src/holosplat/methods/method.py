@@ -84,7 +84,7 @@ class Task:
     def __post_init__(self) -> None:
         if not self.prior.fixes_ratio and shows_no_refraction(self.scan):
             object.__setattr__(self, "delta_told", False)
-            object.__setattr__(self, "prior", MaterialPrior.of_ratio(STAND_IN_RATIO, self.prior.sign))
+            object.__setattr__(self, "prior", self.prior.with_ratio(STAND_IN_RATIO))
 
     def in_windows(self) -> Task:
         """The same task on windows about its matter where these save much (`windows_of`), or the task itself.
@@ -181,6 +181,7 @@ class Method(Protocol):
     mixes_kinds: whether states of different kinds of Objects compete for its result
     any_backend: whether GPUs can compute it, too
     likelier: whether fits are likelier than their starts by noise and prior; frames alone prefer what fits their noise
+    two_sided: whether its matter may lie on both sides of its medium
     """
 
     kind: ClassVar[str]
@@ -188,6 +189,7 @@ class Method(Protocol):
     mixes_kinds: ClassVar[bool] = False
     any_backend: ClassVar[bool] = False
     likelier: ClassVar[bool] = False
+    two_sided: ClassVar[bool] = False
 
     @property
     def wants_levels(self) -> bool:

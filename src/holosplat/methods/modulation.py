@@ -38,7 +38,7 @@ def modulations(u: Tensor, level: float) -> list[Tensor]:
         n = u.shape[axis]
         wave = torch.cos(math.pi * (torch.arange(n, device=u.device) + 0.5) / n)
         sides.append(u * wave.reshape([-1 if a == axis else 1 for a in range(3)]))
-    return [*sides, u * (u / level - 1), _halo(u, 8), _halo(u, 4)]
+    return [*sides, u * (u.abs() / level - 1), _halo(u, 8), _halo(u, 4)]
 
 
 def _halo(u: Tensor, parts: int) -> Tensor:
@@ -69,7 +69,7 @@ def modulated(problem: VolumeProblem, u: Tensor) -> Tensor:
     change = torch.stack([float(s) * c for s, c in zip(shares, changes)]).sum(dim=0)
     before = problem.frames(lines).value
     for _ in range(HALVINGS):
-        moved = (u + change).clamp_min(0)
+        moved = (u + change).clamp_min(problem.lower)
         if problem.frames(problem.lines(moved)).value < before:
             return moved
         change = change / 2
@@ -139,7 +139,7 @@ class Ranges:
         masses = torch.stack([self._inside(change) for change in changes])
         moved = u + torch.einsum("k,kzyx->zyx", shares.float(), torch.stack(changes))
         value, variance = float(self._inside(u) + masses @ shares), float(masses @ covariance @ masses)
-        return Told(value, variance * max(1.0, chi2), moved.clamp_min(0), limit)
+        return Told(value, variance * max(1.0, chi2), moved.clamp_min(problem.lower), limit)
 
     def misfit(self, u: Tensor, limit: float) -> float:
         """χ² of u by frequencies up to `limit`."""

@@ -242,13 +242,13 @@ class SmoothFit:
         if self._volume.grid != grid:
             self._volume = self._volume.resampled(grid)
         u = self._volume.values[0]
-        if not bool((u > 0).any()):  # the frames show nothing but noise
+        if not bool(u.any()):  # the frames show nothing but noise
             if leg.kind == "from coarse":
                 self._volume = begun
             return False
         if leg.kind == "from even":
-            u = torch.full_like(u, self.plan.faint * plateau(u))
-        self._level = leg.loose * plateau(u)
+            u = torch.full_like(u, self.plan.faint * plateau(u.abs()))
+        self._level = leg.loose * plateau(u.abs())
         self._descent = self._descent_from(u, frames, leg)
         return True
 
@@ -280,7 +280,7 @@ class SmoothFit:
         unexplained = _unexplained(problem, u)
         if self._grown(problem, u):
             return
-        if leg.kind in ("round", "from even") and bool((u > 0).any()):
+        if leg.kind in ("round", "from even") and bool(u.any()):
             u = self._mended(problem, u)
         elif leg.kind == "from coarse" and unexplained > 1:
             self._rival = (u, descent.value)
@@ -294,30 +294,31 @@ class SmoothFit:
 
     def _or_nothing(self, u: Tensor) -> Tensor:
         """u, or an empty volume for one that is next to nothing beside the start."""
-        faint = bool((u > 0).any()) and plateau(u) < NOTHING * plateau(self.plan.begun.values[0])
+        faint = bool(u.any()) and plateau(u.abs()) < NOTHING * plateau(self.plan.begun.values[0].abs())
         return torch.zeros_like(u) if faint else u
 
     def _grown(self, problem: VolumeProblem, u: Tensor) -> bool:
         """Whether the last round has found so much more matter that it is done once more, from there."""
-        if self._leg < len(self._legs) - 1 or self._more == MOST or not bool((u > 0).any()):
+        if self._leg < len(self._legs) - 1 or self._more == MOST or not bool(u.any()):
             return False
         more = modulated(problem, u)
-        if float(more.sum()) <= GROWING * float(self._volume.values.sum()):
+        if float(more.abs().sum()) <= GROWING * float(self._volume.values.abs().sum()):
             return False
         self._volume, self._more = self._volume.with_parameters({"values": more[None].cpu()}), self._more + 1
         return True
 
     def _mended(self, problem: VolumeProblem, u: Tensor) -> Tensor:
         """u with what the prior has taken: the edges' way between rounds, the total's at the end. Low frequencies see
-        the total by its absorption, so where δ/β was estimated they are no better than the others."""
+        the total by its absorption, so where δ/β was estimated they are no better than the others; nor where matter
+        lies on both sides of its medium, whose total may be nothing."""
         last = self._leg == len(self._legs) - 1
-        told = last and self.plan.ratio_known
+        told = last and self.plan.ratio_known and not self.plan.prior.two_sided
         return unshrunk(problem, u, self.plan.light is not None) if told else modulated(problem, u)
 
     def _weakened(self, found: VoxelGrid, unexplained: float, problem: VolumeProblem) -> bool:
         """Whether the fit goes elsewhere than on: back to its start with half the prior, or back to a stronger one; not
         to one that explained next to nothing, as a nearly empty volume does."""
-        if not bool((found.values > 0).any()):
+        if not bool(found.values.any()):
             if unexplained <= EMPTY or self._strength <= WEAKEST:
                 return False
             self._again(self._strength / 2 if self._kept else self._strength)

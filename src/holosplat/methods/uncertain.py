@@ -146,9 +146,7 @@ def told(task: Task, found: tuple[Determined, ...]) -> Task:
         return task
     scan, values = placed(task.scan, found), {each.name: each.value for each in found}
     if "delta_beta" in values:
-        return replace(
-            task, scan=scan, prior=MaterialPrior.of_ratio(values["delta_beta"], task.prior.sign), delta_told=True
-        )
+        return replace(task, scan=scan, prior=task.prior.with_ratio(values["delta_beta"]), delta_told=True)
     return replace(
         task,
         scan=scan,

@@ -39,12 +39,15 @@ def _start() -> HolographicTV:
 class SmoothVolume(Method):
     """Continuous matter on voxels: any value from zero up, no levels, no bound, as likely as frames and noise make it.
 
+    Of matter on both sides of its medium, values below zero as well.
+
     Where the frames are of one material's ratio δ/β (known, or estimated where nothing is known), δ is free in every
     voxel. `volume` is the start, whose bound is never used.
     """
 
     kind: ClassVar[str] = "volume"
     likelier: ClassVar[bool] = True
+    two_sided: ClassVar[bool] = True
 
     volume: HolographicTV = field(default_factory=_start)
     """The start: phase retrieval, total variation, and agreement with the frames. With fewer rounds of agreement than
@@ -102,7 +105,8 @@ class SmoothStage:
         light = known and known.part(torch.arange(len(task.scan)), factor)
         backend = options.volume.backend
         material = assumed_material(scan, task.prior, task.on_progress, backend, options.estimate)
-        first, grid = holographic_tv(scan, material, replace(options.volume, upper=0.0), task.on_progress, light)
+        how = replace(options.volume, upper=0.0, two_sided=task.prior.two_sided)
+        first, grid = holographic_tv(scan, material, how, task.on_progress, light)
         field = scan.views.taller(rows_of(grid, scan.views))
         return VoxelGrid(first[None], grid, Matter.one(*material)).resampled(Grid.of_views(field))
 
@@ -116,7 +120,10 @@ class SmoothStage:
         if rows_of(start.grid, scan.views):
             least = LEFT * contrast_level(scan.measured)
             noise, light = noise.at_least(least), light and replace(light, noise=light.noise.at_least(least))
-        how = (options.prior, options.coarser, options.rounds, options.iterations, options.faint, options.loose)
+        two_sided = task.prior.two_sided
+        prior = replace(options.prior, two_sided=two_sided)
+        faint = 0.0 if two_sided else options.faint  # even matter in a medium is the medium
+        how = (prior, options.coarser, options.rounds, options.iterations, faint, options.loose)
         # one density as a level lost 4 % of the total of balls at 500 photons a pixel, and gained nothing
         known = task.prior.materials if len(task.prior.materials) > 1 else ()
         return SmoothFit(SmoothPlan(scan, start, noise, task.prior.fixes_ratio, light, *how, backend, known))

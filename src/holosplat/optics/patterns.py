@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
+from scipy.optimize import nnls
 from torch import Tensor
 
 from ..checks import require
@@ -42,15 +44,36 @@ def fixed_pattern(frames: Tensor, predicted: Tensor) -> Tensor:
 
     The logarithms of frames over predictions are the pattern's and what each frame has alone. Products of different
     frames give the power of the former, and a Wiener filter of single pixels takes their mean for it as far as chance
-    allows: `p = mean · c / (c + o / V)`, c the common power and o that of a frame alone.
+    allows: `p = mean · c / (c + o / V + e)`, c the pattern's power and o that of a frame alone. A pattern knows nothing
+    of matter, and errors of the volume grow with its shadows, of which those of matter near the axis are alike in all
+    frames: e is the part of the common power that goes with the square of what is predicted.
     """
-    left, count = _logarithms(frames) - _logarithms(predicted), len(frames)
+    shadows = _logarithms(predicted)
+    left, count = _logarithms(frames) - shadows, len(frames)
     left = left - left.nanmean()
     total, mean = float(left.square().nanmean()), left.nanmean(dim=0).nan_to_num()
     chance = (total - float(mean.square().mean())) / max(count - 1, 1)  # of the mean: the power of a frame alone over V
-    common = max(float(mean.square().mean()) - chance, 0.0)
-    share = common / (common + chance) if count > 1 and common > 0 else 0.0
-    return (share * mean).exp()
+    shadow = shadows.square().mean(dim=0)
+    even, with_shadows = _powers(mean.square().numpy(), shadow.numpy())
+    common = max(even - chance, 0.0)
+    if count < 2 or common == 0:
+        return torch.ones_like(mean)
+    return (common / (common + chance + with_shadows * shadow) * mean).exp()
+
+
+ROUNDS = 10
+"""Rounds of weights in `_powers`, which converge in fewer."""
+
+
+def _powers(found: np.ndarray, shadow: np.ndarray) -> tuple[float, float]:
+    """a, b ≥ 0 of the powers `found ≈ a + b shadow` [H, W], the likeliest of squares of normal numbers: weighted least
+    squares, with weights of one over the variance, which goes as the square of the mean (Nelder & Wedderburn 1972)."""
+    columns, values = np.stack([np.ones(shadow.size), shadow.ravel()], axis=1), found.ravel()
+    at = np.array([values.mean(), 0.0])
+    for _ in range(ROUNDS if values.any() else 0):
+        weight = 1 / np.maximum(columns @ at, 1e-6 * values.mean())
+        at, _ = nnls(columns * weight[:, None], values * weight)
+    return float(at[0]), float(at[1])
 
 
 def mean_light(frames: Tensor, predicted: Tensor, order: int) -> Tensor:

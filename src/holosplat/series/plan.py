@@ -265,15 +265,17 @@ def prior_of(table: Mapping[str, Any]) -> MaterialPrior:
         kind, first = table["kind"], DeltaBeta(float(table["delta"]), float(table["beta"]))
         sign, medium = table.get("sign", 0), str(table.get("medium", ""))
         require(sign in (-1, 0, 1), f"sign must be -1, 0 or 1, but it is {sign!r}.")
-        if kind == "free":
-            return MaterialPrior.unknown(sign)
-        if kind == "ratio":
-            return MaterialPrior.of_ratio(float(table["ratio"]), sign)
+        if kind in ("free", "ratio"):
+            found = (
+                MaterialPrior.unknown(sign) if kind == "free" else MaterialPrior.of_ratio(float(table["ratio"]), sign)
+            )
+            return found.on_both_sides() if table.get("two_sided", False) else found
         require(kind == "known", f"kind must be known, ratio or free, but it is {kind!r}.")
         others = [DeltaBeta(float(delta), float(beta)) for delta, beta in table.get("others", ())]
         if "second_delta" in table:  # of version 0.2
             others.append(DeltaBeta(float(table["second_delta"]), float(table.get("second_beta", 0.0))))
-        return MaterialPrior.known(first, *others, medium=medium)
+        known = MaterialPrior.known(first, *others, medium=medium)
+        return known.on_both_sides() if table.get("two_sided", False) else known
 
 
 WORD = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.,:+-]*")

@@ -80,7 +80,12 @@ def total_of_run(said: Prediction, frames: Scan, task: Task, constants: tuple[De
     found = cast(Stored, said.object)
     quantity: Literal["δ", "β"] = "δ" if task.delta_told else "β"
     held = _held(found, frames)
-    sign = found.matter.channels[0].sign
+    sign, against = found.matter.channels[0].sign, task.prior.against
+    if task.prior.two_sided:
+        words = (
+            f"total {quantity} against {against} {held:.3g} m³ in the volume; of matter on both sides no error is known"
+        )
+        return TotalMatter(quantity, None, None, held, words)
     if sign * held <= 0:
         return TotalMatter(quantity, None, None, held, f"total {quantity}: none, for the volume is empty")
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), MOST_VIEWS)).round().astype(int))
@@ -97,7 +102,7 @@ def total_of_run(said: Prediction, frames: Scan, task: Task, constants: tuple[De
         total.value,
         total.error,
         total.held,
-        in_words(total, quantity, material, doubt < DOUBTFUL, task.prior.against),
+        in_words(total, quantity, material, doubt < DOUBTFUL, against),
     )
 
 

@@ -16,15 +16,21 @@ def ascend(u: Tensor, q: Tensor, step: float, radius: float) -> None:
 
 
 def descend(
-    slope: Tensor, tau: Tensor, q: Tensor, coupling: float, upper: float, u: Tensor, extrapolated: Tensor
+    slope: Tensor,
+    tau: Tensor,
+    q: Tensor,
+    coupling: float,
+    bounds: tuple[float, float],
+    u: Tensor,
+    extrapolated: Tensor,
 ) -> None:
-    """u ← `clamp(u - tau (slope + coupling ∇ᵀq), 0, upper)`, extrapolated ← `2 u_new - u_old`.
+    """u ← `clamp(u - tau (slope + coupling ∇ᵀq), *bounds)`, extrapolated ← `2 u_new - u_old`.
 
     q must be zero where a forward difference would leave the volume, as `ascend` keeps it.
     """
     arrays = [_pointer(a) for a in (slope, tau, q)]
     moved = [_pointer(a) for a in (u, extrapolated)]
-    native.call("holosplat_tv_descend", _grid(u), *arrays, coupling, upper, *moved, torch.get_num_threads())
+    native.call("holosplat_tv_descend", _grid(u), *arrays, coupling, *bounds, *moved, torch.get_num_threads())
 
 
 def _grid(volume: Tensor) -> native.Grid:

@@ -17,15 +17,21 @@ def ascend(u: Tensor, q: Tensor, step: float, radius: float) -> None:
 
 
 def descend(
-    slope: Tensor, tau: Tensor, q: Tensor, coupling: float, upper: float, u: Tensor, extrapolated: Tensor
+    slope: Tensor,
+    tau: Tensor,
+    q: Tensor,
+    coupling: float,
+    bounds: tuple[float, float],
+    u: Tensor,
+    extrapolated: Tensor,
 ) -> None:
-    """u ← `clamp(u - tau (slope + coupling ∇ᵀq), 0, upper)`, extrapolated ← `2 u_new - u_old`.
+    """u ← `clamp(u - tau (slope + coupling ∇ᵀq), *bounds)`, extrapolated ← `2 u_new - u_old`.
 
     q must be zero where a forward difference would leave the volume, as `ascend` keeps it.
     """
     _require_plain(slope, tau, q, u, extrapolated)
     with launching(u):
-        triton_tv.descend(slope, tau, q, float(coupling), float(upper), u, extrapolated)
+        triton_tv.descend(slope, tau, q, float(coupling), bounds, u, extrapolated)
 
 
 def _require_plain(*arrays: Tensor) -> None:

@@ -15,9 +15,15 @@ def ascend(u: Tensor, q: Tensor, step: float, radius: float) -> None:
 
 
 def descend(
-    slope: Tensor, tau: Tensor, q: Tensor, coupling: float, upper: float, u: Tensor, extrapolated: Tensor
+    slope: Tensor,
+    tau: Tensor,
+    q: Tensor,
+    coupling: float,
+    bounds: tuple[float, float],
+    u: Tensor,
+    extrapolated: Tensor,
 ) -> None:
-    """u ← `clamp(u - tau (slope + coupling ∇ᵀq), 0, upper)`, extrapolated ← `2 u_new - u_old`.
+    """u ← `clamp(u - tau (slope + coupling ∇ᵀq), *bounds)`, extrapolated ← `2 u_new - u_old`.
 
     q must be zero where a forward difference would leave the volume, as `ascend` keeps it.
     """
@@ -27,6 +33,6 @@ def descend(
         inner = component.narrow(axis, 0, length)
         divergence.narrow(axis, 1, length).add_(inner)
         divergence.narrow(axis, 0, length).sub_(inner)
-    moved = (u - tau * (slope + coupling * divergence)).clamp(0, upper)
+    moved = (u - tau * (slope + coupling * divergence)).clamp(*bounds)
     torch.sub(2 * moved, u, out=extrapolated)
     u.copy_(moved)

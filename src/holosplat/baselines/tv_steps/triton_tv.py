@@ -17,10 +17,16 @@ def ascend(u: Tensor, q: Tensor, step: float, radius: float) -> None:
 
 
 def descend(
-    slope: Tensor, tau: Tensor, q: Tensor, coupling: float, upper: float, u: Tensor, extrapolated: Tensor
+    slope: Tensor,
+    tau: Tensor,
+    q: Tensor,
+    coupling: float,
+    bounds: tuple[float, float],
+    u: Tensor,
+    extrapolated: Tensor,
 ) -> None:
     """As `cuda.descend`."""
-    grid, numbers = (triton.cdiv(u.numel(), BLOCK),), (*u.shape, coupling, upper)
+    grid, numbers = (triton.cdiv(u.numel(), BLOCK),), (*u.shape, coupling, *bounds)
     _descend[grid](slope, tau, q, u, extrapolated, *numbers, BLOCK, num_warps=WARPS)
 
 
@@ -49,7 +55,7 @@ def _ascend(u, q, Z, Y, X, step, radius, BLOCK: tl.constexpr):
 
 
 @triton.jit(do_not_specialize=["Z", "Y", "X"])
-def _descend(slope, tau, q, u, extrapolated, Z, Y, X, coupling, upper, BLOCK: tl.constexpr):
+def _descend(slope, tau, q, u, extrapolated, Z, Y, X, coupling, lower, upper, BLOCK: tl.constexpr):
     at, z, y, x = places(tl.program_id(0), Y, X, BLOCK)
     there, plane = z < Z, Y.to(tl.int64) * X
     q1 = q + Z * plane
@@ -59,6 +65,6 @@ def _descend(slope, tau, q, u, extrapolated, Z, Y, X, coupling, upper, BLOCK: tl
     divergence = inflow - _load(q, at, there) - _load(q1, at, there) - _load(q2, at, there)
     old = _load(u, at, there)
     moved = old - _load(tau, at, there) * (_load(slope, at, there) + coupling * divergence)
-    fresh = tl.minimum(tl.maximum(moved, 0.0), upper)
+    fresh = tl.minimum(tl.maximum(moved, lower), upper)
     tl.store(extrapolated + at, 2 * fresh - old, mask=there)
     tl.store(u + at, fresh, mask=there)

@@ -53,7 +53,8 @@ def admm(
 
     def solve(frames: Tensor, exposures: Exposures, noise: Noise, missing: Gaps, on_progress: Advance) -> Tensor:
         how = (options.backend, options.leaves, options.prior)
-        model = WaveModel(frames, exposures, beta / delta, noise, *how, sign=math.copysign(1.0, delta), missing=missing)
+        told = {"sign": math.copysign(1.0, delta), "missing": missing, "two_sided": options.two_sided}
+        model = WaveModel(frames, exposures, beta / delta, noise, *how, **told)
         return model.thickness(_alternate(model, options, on_progress), delta)
 
     return view_by_view(frames, exposures, delta, (options.noise, missing), solve, on_progress)

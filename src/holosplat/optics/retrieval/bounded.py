@@ -1,8 +1,8 @@
-"""A first estimate for everything iterative: the linear inverse, bounded from below by zero, and where matter is.
+"""A first estimate for everything iterative: the linear inverse where it is surely not zero, and where matter is.
 
 One frame hardly constrains the lowest frequencies, and the frequencies where the response is zero. Two conditions fill
 them in: matter is nowhere negative, and there is none outside its bodies. Of holes in a medium that is said of the
-thickness of the holes.
+thickness of the holes; of matter on both sides of its medium the second alone.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ lowest frequencies; or it is what a volume lacks, which is flatter than matter. 
 
 @dataclass(frozen=True)
 class Estimate:
-    """phase: delay (of holes: advance) [V, H, W] in radians, not negative, float64; support: [V, H, W] bool, where
-    there may be matter."""
+    """phase: delay (of holes: advance) [V, H, W] in radians, not negative unless matter is two-sided, float64; support:
+    [V, H, W] bool, where there may be matter."""
 
     phase: Tensor
     support: Tensor
@@ -49,6 +49,7 @@ def bounded_estimate(
     sign: float = 1.0,
     *,
     missing: Gaps = None,
+    two_sided: bool = False,
 ) -> Estimate:
     """From frames [V, H, W] of a material with β/δ = `ratio` and that `sign` of δ; noise: theirs, None to estimate it.
 
@@ -57,7 +58,7 @@ def bounded_estimate(
     `SIGNIFICANT` deviations of its noise and zero elsewhere, for noise with its negative half cut off would pass for
     matter (a support found anew in every round: the "shrinkwrap" of Marchesini et al. 2003).
 
-    missing: pixels [V, H, W] bool without a value (`completed`).
+    missing: pixels [V, H, W] bool without a value (`completed`). two_sided: whether phases may be negative.
     leaves: whether matter goes on above and below the frame. Air there would take a soft body away far into the frame,
     for only the bends of its shadow are seen; it may then go on, and ends as smoothly as it can. prior: expected power
     (default: the one that the frames show, or `FIXED` where matter leaves them).
@@ -76,9 +77,13 @@ def bounded_estimate(
     inside = torch.zeros_like(linear[:1])
     inside[:, slice(None) if leaves else crop[1], crop[2]] = 1
     phase = linear
+
+    def matter_of(phase: Tensor) -> Tensor:
+        return phase * ((phase.abs() if two_sided else phase) > least)
+
     for _ in range(LEAVING_STEPS if leaves else STEPS):
-        matter = phase * (phase > least) * inside
+        matter = matter_of(phase) * inside
         phase = linear + filtered(matter, trusted)
-    matter = (phase * (phase > least))[crop]
-    grown = max_pool2d((matter > 0).double()[None], 3, 1, 1)[0] > 0  # thin rims lie below the threshold
+    matter = matter_of(phase)[crop]
+    grown = max_pool2d((matter != 0).double()[None], 3, 1, 1)[0] > 0  # thin rims lie below the threshold
     return Estimate(matter, grown)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -61,6 +62,8 @@ class Regularised:
     """Whether matter goes on above and below the frames (`bounded_estimate`)."""
     prior: Prior | None = None
     """Expected power of the phase (default: the one that the frames show)."""
+    two_sided: bool = False
+    """Whether phases may be negative, of matter on both sides of its medium."""
 
     def __post_init__(self) -> None:
         at_least(self, 1, "iterations")
@@ -75,6 +78,7 @@ class WaveModel:
     it. float32 frames are computed by `backend`, float64 ones by `reference`. `phase` is the estimate to start from,
     `missing` [V, h, w] marks pixels without a value, which have no part in the misfit,
     `ratio` the matter's β/δ at the frames' energy, which is one, `sign` that of its δ (-1: holes, which advance waves),
+    `two_sided` whether phases may be negative,
     and `strongest` [V, 1, 1] about the curvature of the strongest frequency: 1 where fringes are seen, and far less
     where hardly any are.
     """
@@ -91,9 +95,11 @@ class WaveModel:
         *,
         sign: float = 1.0,
         missing: Gaps = None,
+        two_sided: bool = False,
     ) -> None:
-        estimate = bounded_estimate(frames, exposures, ratio, noise, leaves, prior, sign, missing=missing)
-        self.sign = sign
+        told = {"missing": missing, "two_sided": two_sided}
+        estimate = bounded_estimate(frames, exposures, ratio, noise, leaves, prior, sign, **told)
+        self.sign, self._least = sign, -math.inf if two_sided else 0.0
         energy = exposures.one_energy("the wave model of a phase retrieval")
         self.exposures, self.ratio = exposures, float(absorption(exposures, ratio)[0])
         self.backend = resolve("reference" if frames.dtype == torch.float64 else backend)
@@ -138,8 +144,8 @@ class WaveModel:
         return support, self.bounded(phase, support)
 
     def bounded(self, phase: Tensor, support: Tensor | None = None) -> Tensor:
-        """The phase where it is positive and inside the support, zero elsewhere."""
-        return phase.clamp_min(0) * (self.support if support is None else support)
+        """The phase where it may be (positive, unless matter is two-sided, and inside the support), zero elsewhere."""
+        return phase.clamp_min(self._least) * (self.support if support is None else support)
 
     def thickness(self, phase: Tensor, delta: float) -> Tensor:
         """Means over the frame's pixels [V, h, w], in metres."""

@@ -45,18 +45,18 @@ def tikhonov(
 ) -> Tensor:
     """Thickness [V, H, W] in metres of one material, β of any sign, that agrees with frames [V, H, W].
 
-    It minimises `½ Σ (√I(φ) - √I)² + ½ Σ R |F[φ]|²` over phases φ = k|δ|T that are not negative and lie within a
-    support, as Huhn et al. (2022) do, with three differences. R is the noise over the expected power (`Spectra`),
-    instead of one constant below and another above the first maximum. Steps are scaled by frequency and damped as by
-    Levenberg (1944) and Marquardt (1963), so that the lowest frequencies, whose signal is a millionth of the others',
-    change too. The
-    iteration starts from `bounded_estimate` and keeps its support. A step that would not lower the objective is
-    refused, and its view is damped more.
+    It minimises `½ Σ (√I(φ) - √I)² + ½ Σ R |F[φ]|²` over phases φ = k|δ|T that are not negative (unless `two_sided`)
+    and lie within a support, as Huhn et al. (2022) do, with three differences. R is the noise over the expected power
+    (`Spectra`), instead of one constant below and another above the first maximum. Steps are scaled by frequency and
+    damped as by Levenberg (1944) and Marquardt (1963), so that the lowest frequencies, whose signal is a millionth of
+    the others', change too. The iteration starts from `bounded_estimate` and keeps its support. A step that would not
+    lower the objective is refused, and its view is damped more.
     """
 
     def solve(frames: Tensor, exposures: Exposures, noise: Noise, missing: Gaps, on_progress: Advance) -> Tensor:
         how = (options.backend, options.leaves, options.prior)
-        model = WaveModel(frames, exposures, beta / delta, noise, *how, sign=math.copysign(1.0, delta), missing=missing)
+        told = {"sign": math.copysign(1.0, delta), "missing": missing, "two_sided": options.two_sided}
+        model = WaveModel(frames, exposures, beta / delta, noise, *how, **told)
         return model.thickness(descend(model, options, on_progress)[0], delta)
 
     return view_by_view(frames, exposures, delta, (options.noise, missing), solve, on_progress)

@@ -1,0 +1,140 @@
+"""Continuous matter on both sides of its medium: found, decided for, told, and refused where it cannot be."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import holosplat as hs
+from holosplat.baselines import HolographicTV, holographic_tv
+from holosplat.checks import InputError
+from holosplat.cli.options import PriorOptions
+from holosplat.geometry import Grid, Views
+from holosplat.matter import DeltaBeta, MaterialPrior
+from holosplat.methods import METHODS, SmoothVolume, Task
+from holosplat.methods.contrast import ABOVE, BOTH, STAGE, decide_sides
+from holosplat.methods.trials import first_of_task
+from holosplat.optics.background import LightOptions
+from holosplat.optics.retrieval import Tikhonov, tikhonov
+from holosplat.scan import Exposures, Scan
+from holosplat.series.plan import prior_of
+from holosplat.specimens.continuous import ContinuousScene, Soft, ellipsoid
+from holosplat.specimens.red_cells import random_cells
+
+WATER = DeltaBeta(5.75e-7, 2.56e-10)
+DENSE, THIN = DeltaBeta(0.4 * WATER.delta, 0.4 * WATER.beta), DeltaBeta(-WATER.delta, -WATER.beta)
+PIXEL, SHAPE, VIEWS = 1e-6, (33, 41), 9
+
+
+def of(scene, photons: float | None = None) -> Scan:
+    exposures = Exposures.of(Views.evenly_spaced(VIEWS, SHAPE, PIXEL), 20.0, 0.1)
+    return hs.simulate(scene, exposures, photons_per_pixel=photons, seed=3, is_test=np.zeros(VIEWS, dtype=bool))
+
+
+@pytest.fixture(scope="module")
+def pair() -> ContinuousScene:
+    """A denser soft ball, and a hole with a sharp edge."""
+    dense = ellipsoid(np.array([-8e-6, 1e-6, 3e-6]), (7e-6,) * 3, Soft(0.5), DENSE)
+    return ContinuousScene((dense, ellipsoid(np.array([8e-6, -2e-6, -2e-6]), (5e-6,) * 3, Soft(0.0), THIN)))
+
+
+@pytest.fixture(scope="module")
+def scan(pair) -> Scan:
+    return of(pair)
+
+
+@pytest.fixture(scope="module")
+def bodies() -> Scan:
+    matter = DeltaBeta(4e-7, 4e-7 / 1500)
+    return of(hs.MeshScene.of_one_material(random_cells(3, (32e-6, 28e-6, 32e-6), 5, 12e-6), matter), 5000)
+
+
+def test_retrieval_finds_thickness_of_both_signs(pair, scan):
+    """Of one sign, what is denser is lost behind the bound or the hole is."""
+    frames = torch.from_numpy(scan.frames).double()
+    both, one = (tikhonov(frames, scan.exposures, *WATER, options=Tikhonov(two_sided=t)) for t in (True, False))
+    lines = lines_of(pair, scan)
+    error = {name: float((found - lines).norm() / lines.norm()) for name, found in (("both", both), ("one", one))}
+    assert error["both"] < 0.25
+    assert error["one"] > 0.5
+    assert float(one.min()) == 0
+
+
+def lines_of(pair: ContinuousScene, scan: Scan) -> torch.Tensor:
+    """Thickness [V, H, W] of water, in metres."""
+    return pair.project(scan.exposures.views)[1].double() / WATER.delta
+
+
+@pytest.mark.parametrize("two_sided", [True, False])
+def test_first_volumes_have_the_sides_that_they_may_have(two_sided, scan, pair):
+    how = HolographicTV(retrieval=20, iterations=80, corrections=0, upper=0.0, refine=1, two_sided=two_sided)
+    values, grid = holographic_tv(scan, WATER, how, lambda stage, share: None)
+    true = pair.voxelise(grid).delta / WATER.delta
+    error = float(np.linalg.norm(values.numpy() - true) / np.linalg.norm(true))
+    assert (error < 0.5) == two_sided
+    assert (float(values.min()) < -0.5) == two_sided
+
+
+def test_the_smooth_volume_finds_both_sides(scan, pair):
+    prior = MaterialPrior.of_ratio(WATER.ratio).on_both_sides()
+    light = LightOptions("even", still="none", noise="white")
+    done = hs.reconstruct(scan, prior, SmoothVolume(), light=light)
+    truth = pair.voxelise(Grid.of_views(scan.views))
+    found = done.object.voxelise(truth.grid).delta
+    assert np.linalg.norm(found - truth.delta) < 0.2 * np.linalg.norm(truth.delta)
+    assert found.min() < 0.8 * truth.delta.min()
+    assert found.max() > 0.8 * truth.delta.max()
+    assert done.total is not None
+    assert done.total.value is None
+    assert "on both sides no error is known" in done.total.words
+
+
+def test_both_sides_are_taken_where_they_predict_unseen_frames(scan):
+    first = first_of_task(Task(scan, MaterialPrior.of_ratio(WATER.ratio).signed(-1)))
+    found, decision = decide_sides(first, LightOptions())
+    assert decision.name == STAGE
+    assert decision.choice == BOTH
+    assert found.prior.two_sided
+    assert found.prior.sign == -1
+
+
+def test_bodies_of_one_side_stay_there(bodies):
+    """Cells in air, in noise: a family that the rule was not made on."""
+    first = first_of_task(Task(bodies, MaterialPrior.of_ratio(1500).signed(1)))
+    found, decision = decide_sides(first, LightOptions())
+    assert decision.choice == ABOVE
+    assert found is first
+
+
+def test_methods_of_one_side_refuse_both(bodies):
+    prior = MaterialPrior.of_ratio(1500).on_both_sides()
+    with pytest.raises(InputError, match="both sides of its medium is continuous, but the method is gaussians"):
+        hs.reconstruct(bodies, prior, METHODS["gaussians"])
+
+
+def test_what_is_told_is_kept_in_files():
+    for prior in (
+        MaterialPrior.unknown(),
+        MaterialPrior.of_ratio(900.0, -1),
+        MaterialPrior.known(THIN, medium="water"),
+    ):
+        both = prior.on_both_sides()
+        assert both.two_sided
+        assert prior_of(both.as_dict()) == both
+        assert prior_of(prior.as_dict()) == prior
+    with pytest.raises(InputError, match="must be of one --material"):
+        MaterialPrior.known(WATER, DENSE).on_both_sides()
+
+
+def test_the_command_line_tells_the_side():
+    ratio = PriorOptions(delta_beta=2250.0)
+    assert replace(ratio, contrast="both").prior(20.0).two_sided
+    assert [replace(ratio, contrast=side).prior(20.0).sign for side in ("auto", "above", "below")] == [0, 1, -1]
+    told = PriorOptions(material=("air",), medium="water")
+    assert replace(told, contrast="both").prior(20.0).two_sided
+    assert replace(told, contrast="below").prior(20.0) == told.prior(20.0)
+    with pytest.raises(InputError, match="--contrast must be on the side of --material, but it is above"):
+        replace(told, contrast="above").prior(20.0)
