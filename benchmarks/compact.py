@@ -27,7 +27,7 @@ import holosplat as hs
 from holosplat.geometry import Grid
 from holosplat.io.compact import steps_of
 from holosplat.io.objects import read_object, write_compact
-from holosplat.io.ome_zarr import CHUNK
+from holosplat.io.ome import CHUNK
 from holosplat.matter import Matter
 from holosplat.representations import Stored, VoxelGrid
 from holosplat.workflows.evaluate import score_object

@@ -20,8 +20,7 @@ from rows import merge
 
 import holosplat as hs
 from holosplat.io.compact import Steps
-from holosplat.io.objects import read_object, write_compact, write_object
-from holosplat.io.series import names_of, read_series, write_series
+from holosplat.io.objects import names_of, read_object, read_series, write_compact, write_object, write_series
 from holosplat.representations import MovingGaussians, MovingSurfaces, Stored
 from holosplat.workflows.reconstruction import instants_of
 

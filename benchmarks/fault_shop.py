@@ -16,9 +16,8 @@ from forked import run
 from own_case import two_cells
 
 from holosplat.checks import InputError
-from holosplat.io.formats import read
+from holosplat.io.formats import read, read_volume_file
 from holosplat.io.pvd import read_pvd
-from holosplat.io.volume_formats import read_volume_file
 from holosplat.io.vtk import read_meshes, write_mesh
 from holosplat.learning.weights import read_weights
 from holosplat.mesh import TriangleMesh

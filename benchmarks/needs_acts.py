@@ -25,7 +25,7 @@ from rows import read, write
 
 from holosplat.align import PoseOptions
 from holosplat.beamline.simulate import Simulation
-from holosplat.cli.dataset import _needs
+from holosplat.cli.learn import _needs
 from holosplat.geometry import Views
 from holosplat.io.vtk import write_mesh
 from holosplat.learning.network import Size

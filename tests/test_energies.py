@@ -12,9 +12,9 @@ import torch
 from holosplat.beamline.simulate import Simulation, frames_by_energy, simulate
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views, rotation_y
+from holosplat.io.images import read_tiff, write_tiff
 from holosplat.io.nerf_synthetic import read_nerf_synthetic, write_nerf_synthetic
 from holosplat.io.nxtomo import read_scan, write_scan
-from holosplat.io.tiff import read_tiff, write_tiff
 from holosplat.materials import HAEMOGLOBIN, PLASMA, RED_CELL, WATER, dispersion
 from holosplat.matter import MaterialPrior
 from holosplat.methods.presets import preset

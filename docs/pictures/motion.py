@@ -6,8 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import holosplat as hs
-from holosplat.io.formats import read_as
-from holosplat.io.run_scan import run_reading
+from holosplat.io.formats import read_as, run_reading
 from holosplat.report.moving_figures import animation, shapes_figure
 from holosplat.report.run import moving_of
 from holosplat.workflows.track import read_errors

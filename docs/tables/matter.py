@@ -6,19 +6,20 @@ from .benchmark import Row, markdown, read, table
 
 KINDS = ["bubbles", "cuvette", "jet", "break-up", "crack", "shock", "keyhole", "lattice", "fibres", "channel", "star"]
 HEAD = {
-    "told": "by default, told the materials",
-    "nothing told": "by default, nothing told",
-    "Paganin, TV": "Paganin and total variation",
+    ("large", "told"): "12 views, no noise: told",
+    ("small", "told"): "8 noisy views: told",
+    ("small", "nothing told"): "nothing told",
+    ("small", "Paganin, TV"): "Paganin and total variation",
 }
 
 
 @table("matter", "python benchmarks/matter_scenes.py --seeds 101", "hours", "matter_scenes.csv")
-def scenes(size: str = "small") -> str:
+def scenes() -> str:
     """Error of δ / Dice / total over the true one, of each kind by each run that there is, of seeds for reporting."""
-    rows = [row for row in read("matter_scenes.csv") if row["size"] == size and row["use"] == "reporting"]
-    runs, lines = [run for run in HEAD if any(row["run"] == run for row in rows)], []
+    rows = [row for row in read("matter_scenes.csv") if row["use"] == "reporting"]
+    runs, lines = [run for run in HEAD if any((row["size"], row["run"]) == run for row in rows)], []
     for kind in KINDS:
-        own = {row["run"]: row for row in rows if row["kind"] == kind}
+        own = {(row["size"], row["run"]): row for row in rows if row["kind"] == kind}
         if own:
             lines.append([f"`{kind}`", *(_three(own.get(run)) for run in runs)])
     return markdown(("kind", *(HEAD[run] for run in runs)), lines)

@@ -102,6 +102,8 @@ def ranged(kind: type[Kind]) -> type[Kind]:
     own: Callable[[Any], None] | None = getattr(kind, "__post_init__", None)
 
     def checked(self: Any) -> None:
+        if _later:
+            return
         try:
             if own is not None:
                 own(self)
@@ -110,8 +112,7 @@ def ranged(kind: type[Kind]) -> type[Kind]:
         except Exception:  # of numbers that it did not think of
             require_sound(self)
             raise
-        if not _later:
-            require_sound(self)
+        require_sound(self)
 
     _ranged.add(kind)
     setattr(kind, "__post_init__", checked)  # noqa: B010  # only a class of its own is known to have it
@@ -151,6 +152,7 @@ def _require_sound_within(made: Any) -> None:
         return
     if not _ranged.isdisjoint(type(made).__mro__):
         require_sound(made, flag)
+        made.__post_init__()  # pyright: ignore[reportAttributeAccessIssue]  # which `ranged` has set
     for one in fields(made):
         _require_sound_within(getattr(made, one.name, None))
 

@@ -11,7 +11,7 @@ from helpers.cli import COLUMNS, PIXEL, ROWS, Workshop, holosplat, refused, work
 from holosplat.cli.compare import _side
 from holosplat.metrics import fourier_shell_correlation
 from holosplat.report.compare import Comparison, differing, in_columns
-from holosplat.report.tables import Table
+from holosplat.report.page import Table
 
 
 @pytest.fixture(scope="module")

@@ -10,10 +10,9 @@ import numpy as np
 import tifffile
 
 from helpers.cli import holosplat, refused, worked
-from holosplat.io.objects import read_object
-from holosplat.io.ome_tiff import write_ome_tiff
-from holosplat.io.series import read_series
-from holosplat.io.volume_formats import read_volume_file
+from holosplat.io.formats import read_volume_file
+from holosplat.io.objects import read_object, read_series
+from holosplat.io.ome import write_ome_tiff
 from holosplat.io.volumes import read_volume, write_volume
 
 

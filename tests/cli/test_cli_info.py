@@ -19,10 +19,10 @@ from PIL import Image
 from helpers.cli import copied, drop, holosplat, refused, truncated, worked
 from helpers.two_balls import scan as two_balls
 from holosplat.geometry import Grid
+from holosplat.io.formats import FORMATS, write_volume_file
+from holosplat.io.images import write_tiff
 from holosplat.io.nxtomo import write_scan
 from holosplat.io.raw_file import ScanFile
-from holosplat.io.tiff import write_tiff
-from holosplat.io.volume_formats import FORMATS, write_volume_file
 from holosplat.io.volumes import Contents
 from holosplat.matter import DeltaBeta, Matter
 from holosplat.representations import VoxelGrid

@@ -9,10 +9,9 @@ import pytest
 
 from holosplat.checks import InputError
 from holosplat.cli import track as of_bodies
-from holosplat.cli.carried import CarriedFlags
-from holosplat.cli.commands import Asked, reconstruct
-from holosplat.cli.live import LiveFlags
+from holosplat.cli.commands import Asked, CarriedFlags, reconstruct
 from holosplat.cli.options import MethodOptions
+from holosplat.cli.view import LiveFlags
 from holosplat.io.reading import Part, Reading
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from helpers.cli import holosplat, worked
-from holosplat.cli import motion
+from holosplat.cli import track as motion
 from holosplat.fit.run import Run
 from holosplat.io.nxtomo import read_scan
 from holosplat.io.reading import Reading

@@ -15,8 +15,7 @@ from helpers.cli import holosplat, known, refused, worked
 from holosplat.cli import view as commands
 from holosplat.io.compact import Steps
 from holosplat.io.lock import sole_writer
-from holosplat.io.objects import read_object
-from holosplat.io.series import write_series
+from holosplat.io.objects import read_object, write_series
 from holosplat.show import server
 
 

@@ -13,7 +13,7 @@ from holosplat.checks import InputError
 from holosplat.geometry import Grid
 from holosplat.io.compact import FORMAT, Steps, steps_of
 from holosplat.io.objects import read_object, write_compact, write_object
-from holosplat.io.ome_tiff import write_ome_tiff
+from holosplat.io.ome import write_ome_tiff
 from holosplat.matter import DeltaBeta, Matter
 from holosplat.representations import GaussianCloud, MovingSurfaces, Stored, SurfaceMesh, VoxelGrid
 from holosplat.representations.gaussians import raw_of

@@ -15,9 +15,9 @@ from PIL import Image
 from holosplat.checks import InputError
 from holosplat.geometry import rotation_y
 from holosplat.io.formats import loader_of, open_raw, read
+from holosplat.io.images import write_tiff
 from holosplat.io.raw_file import DARK, FLAT, PROJECTION
 from holosplat.io.reading import Reading, Told
-from holosplat.io.tiff import write_tiff
 from holosplat.scan import Scan
 from holosplat.workflows.correct import CorrectionOptions, correct
 

@@ -17,11 +17,11 @@ from holosplat.checks import InputError
 from holosplat.geometry import Views, rotation_y
 from holosplat.io import formats
 from holosplat.io.formats import loader_of
+from holosplat.io.images import write_tiff
 from holosplat.io.json import write_json
-from holosplat.io.nerf_synthetic import NerfOptions, write_nerf_synthetic
+from holosplat.io.nerf_synthetic import NerfOptions, write_nerf_synthetic, write_png
 from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.io.r2_gaussian import R2Options, write_r2_gaussian
-from holosplat.io.tiff import write_tiff
 from holosplat.scan import Exposures, Scan
 
 N, SHAPE = 4, (9, 11)
@@ -100,6 +100,14 @@ def test_a_run_without_its_scan_is_named(tmp_path, scan, time_frame, said):
     write_scan(tmp_path / "series.nxs", a_scan())
     with pytest.raises(InputError, match=said):
         io.read(a_run(tmp_path / "run", tmp_path / scan, time_frame))
+
+
+def test_images_beside_the_scan_of_another_format_are_not_read(tmp_path):
+    """A folder is one of images where no other format recognises it."""
+    write_scan(tmp_path / "scan.nxs", a_scan())
+    run = a_run(tmp_path / "run", tmp_path / "scan.nxs")
+    write_png(run / "preview.png", np.zeros(SHAPE), "grey16")
+    assert loader_of(run).name == "run"
 
 
 def test_what_is_no_scan_is_told_what_is_known(places):

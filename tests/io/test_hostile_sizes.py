@@ -16,11 +16,10 @@ import torch
 from holosplat.beamline.grow import Growth, SeriesFolder
 from holosplat.beamline.misalignment import Directions
 from holosplat.checks import InputError, as_written
-from holosplat.io.guard import read_array, require_inflated
+from holosplat.io.guard import blocks_fault, read_array, require_inflated
+from holosplat.io.images import _pages
 from holosplat.io.stacks import stack_of
-from holosplat.io.tiff import _pages
 from holosplat.io.vtk import read_meshes
-from holosplat.io.vtk_guard import blocks_fault
 from holosplat.workflows.run_folder import RunFolder
 
 HUGE = 10**12

@@ -16,13 +16,20 @@ from hypothesis.extra.numpy import arrays
 
 from helpers.strategies import NAMES, VIEWS, clouds, images, numbers, scans, vectors
 from holosplat.geometry import Grid, Views
+from holosplat.io.images import read_tiff, write_tiff
 from holosplat.io.json import read_json, write_json
-from holosplat.io.nerf_synthetic import NerfOptions, grey_range, read_nerf_synthetic, write_nerf_synthetic
+from holosplat.io.nerf_synthetic import (
+    LEVELS,
+    NerfOptions,
+    grey_range,
+    read_nerf_synthetic,
+    read_png,
+    write_nerf_synthetic,
+    write_png,
+)
 from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.io.objects import read_object, write_object
-from holosplat.io.png import LEVELS, read_png, write_png
 from holosplat.io.r2_gaussian import R2Options, read_r2_gaussian, write_r2_gaussian
-from holosplat.io.tiff import read_tiff, write_tiff
 from holosplat.io.volumes import read_volume, write_volume
 from holosplat.io.vtk import read_meshes, write_mesh
 from holosplat.matter import Matter

@@ -13,7 +13,7 @@ from helpers.cli import holosplat, refused, worked
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
 from holosplat.io import read_scan
-from holosplat.io.arrays import recognises
+from holosplat.io.arrays import LOADER
 from holosplat.io.formats import read
 from holosplat.io.hdf5 import attribute_numbers, attribute_text
 from holosplat.io.nxtomo import write_scan
@@ -116,9 +116,9 @@ def test_volumes(volume):
 def test_plain_arrays(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["counts"] = np.ones((4, 5, 7))
-    assert recognises(tmp_path / "a.h5")
+    assert LOADER.recognises(tmp_path / "a.h5")
     path = nulled(tmp_path / "a.h5", "counts")
-    assert not recognises(path)
+    assert not LOADER.recognises(path)
     with pytest.raises(InputError, match=r"null\.h5"):
         read(path)
 

@@ -15,10 +15,9 @@ from numcodecs import get_codec
 from helpers.splats import cloud
 from holosplat.checks import InputError
 from holosplat.geometry import Grid
-from holosplat.io import ome_zarr
-from holosplat.io.ome_zarr import halved, levels_of, write_ome_zarr
-from holosplat.io.solids import PLAY_S, write_glb, write_moving_glb, write_stl
-from holosplat.io.splats import CONSTANT, DEPTH, write_splats
+from holosplat.io import ome
+from holosplat.io.ome import halved, levels_of, write_ome_zarr
+from holosplat.io.solids import CONSTANT, DEPTH, PLAY_S, write_glb, write_moving_glb, write_splats, write_stl
 from holosplat.matter import DeltaBeta, Matter
 from holosplat.mesh import TriangleMesh
 from holosplat.representations import GaussianCloud, MovingSurfaces, TimeBasis, VoxelGrid
@@ -55,7 +54,7 @@ def by_hand(folder: Path, level: str) -> np.ndarray:
 
 
 def test_ome_zarr_holds_both_channels_at_all_levels(tmp_path, monkeypatch):
-    monkeypatch.setattr(ome_zarr, "SLAB_VOXELS", 1)  # a row of chunks at a time
+    monkeypatch.setattr(ome, "SLAB_VOXELS", 1)  # a row of chunks at a time
     obj = voxels()
     write_ome_zarr(tmp_path / "v.ome.zarr", obj, GRID)
     true = obj.voxelise(GRID)

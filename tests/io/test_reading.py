@@ -11,11 +11,10 @@ import pytest
 
 from holosplat.checks import InputError
 from holosplat.geometry import Views, rotation_y
-from holosplat.io.formats import read, read_as
+from holosplat.io.formats import read, read_as, run_reading, run_source
 from holosplat.io.json import write_json
 from holosplat.io.nxtomo import write_scan
 from holosplat.io.reading import Part, Reading, Told, read_angles
-from holosplat.io.run_scan import run_reading, run_source
 from holosplat.scan import Exposures, Scan
 
 N, SHAPE, PIXEL = 7, (9, 13), 1e-6

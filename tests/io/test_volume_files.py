@@ -8,7 +8,7 @@ import tifffile
 
 from holosplat.checks import InputError
 from holosplat.geometry import Grid
-from holosplat.io.volume_formats import StackMeaning, read_specimen
+from holosplat.io.formats import StackMeaning, read_specimen
 from holosplat.io.volumes import write_volume
 from holosplat.matter import DeltaBeta
 from holosplat.volume import Volume

@@ -17,9 +17,8 @@ import torch
 from holosplat.checks import InputError
 from holosplat.geometry import Grid
 from holosplat.io import volumes
-from holosplat.io.mrc import HEADER
-from holosplat.io.plain_values import write_xdmf
-from holosplat.io.volume_formats import FORMATS, of_time, read_volume_file, write_volume_file
+from holosplat.io.formats import FORMATS, of_time, read_volume_file, write_volume_file
+from holosplat.io.plain_values import HEADER, write_xdmf
 from holosplat.io.volumes import Contents
 from holosplat.matter import DeltaBeta, Matter
 from holosplat.representations import VoxelGrid

@@ -26,10 +26,10 @@ from holosplat.report.moving_figures import (
     shapes_figure,
     trajectories_figure,
 )
+from holosplat.report.page import score_tables, verdict
 from holosplat.report.run import moving_of
 from holosplat.report.style import new_figure
 from holosplat.report.surface import body_colours, paint_bodies
-from holosplat.report.tables import score_tables, verdict
 from holosplat.representations import SurfaceMesh
 from holosplat.specimens.red_cells import icosphere
 from holosplat.volume import Volume

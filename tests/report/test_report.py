@@ -3,6 +3,8 @@
 import base64
 import math
 import re
+from pathlib import Path
+from runpy import run_path
 from urllib.parse import unquote
 
 import matplotlib
@@ -17,7 +19,6 @@ from holosplat.metrics import volume_scores
 from holosplat.report import (
     HeldOutViews,
     ProjectedMaps,
-    hero_figure,
     render_page,
     render_surface,
     write_report,
@@ -27,6 +28,8 @@ from holosplat.report.figures import richest_planes, scene_figure, slices_figure
 from holosplat.report.style import GROUND, INK, data_uri
 from holosplat.report.surface import Deviation, camera
 from holosplat.volume import Volume
+
+HERO = Path(__file__).parents[2] / "docs" / "pictures" / "hero.py"
 
 
 @pytest.fixture(scope="module")
@@ -184,7 +187,7 @@ def test_mismatched_content_is_refused():
 
 def test_banner_has_its_size(undrawn_reports):
     truth, found = scene()
-    figure = hero_figure(content().held_out.measured[0], PITCH, found, truth)
+    figure = run_path(str(HERO))["hero_figure"](content().held_out.measured[0], PITCH, found, truth)
     assert tuple(figure.get_size_inches() * figure.dpi) == pytest.approx((1600, 500))
 
 

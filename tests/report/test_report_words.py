@@ -15,9 +15,9 @@ from holosplat.report import (
 )
 from holosplat.report.blocks import _ends
 from holosplat.report.content import flatten
+from holosplat.report.page import duration, headline, percent
 from holosplat.report.style import format_length, in_print, scientific
 from holosplat.report.surface import camera
-from holosplat.report.tables import duration, headline, percent
 from holosplat.units import wavelength
 from holosplat.volume import Volume
 from holosplat.workflows.verdict import Verdict

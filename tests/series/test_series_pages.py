@@ -18,7 +18,7 @@ from helpers.cli import holosplat, refused, worked
 from helpers.moving_ellipsoids import TIMES, true_paths
 from helpers.moving_ellipsoids import scan as ellipsoids
 from holosplat.io.nxtomo import write_scan
-from holosplat.report.tables import Headline
+from holosplat.report.page import Headline
 from holosplat.representations import MovingSurfaces
 from holosplat.series.collect import collect, same_bodies
 from holosplat.series.folder import SeriesFolder, duration, table_of, time_left

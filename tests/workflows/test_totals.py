@@ -30,7 +30,7 @@ from holosplat.methods import (
 from holosplat.methods.mass import Total
 from holosplat.methods.uncertain import Determined
 from holosplat.report.content import ReportContent
-from holosplat.report.tables import score_tables
+from holosplat.report.page import score_tables
 from holosplat.representations import VoxelGrid
 from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
 from holosplat.workflows.run_folder import RunFolder

@@ -94,13 +94,13 @@ class Directions:
     views: Many | None = None
     """Number of views, evenly spaced over 180°."""
     angles_deg: tuple[Signed, ...] = ()
-    """Angles about the rotation axis [degrees]."""
+    """Or: the views' angles about the rotation axis [degrees]."""
     tilts_deg: tuple[Signed, ...] = ()
-    """Tilts of the beam out of the plane normal to the axis [degrees], one an angle (default: none)."""
+    """With these: how far each view leaves the plane normal to the axis [degrees]."""
     rotations: Path | None = None
-    """File (.npy) of rotation matrices [V, 3, 3]."""
+    """Or: a .npy file of rotation matrices [V, 3, 3], x_lab = R x_obj."""
     geometry: Geometry | None = None
-    """Name of a known geometry, a key of `GEOMETRIES`."""
+    """Or: a known geometry: 16 even views, or two beams (0°, 23.8°) or three (0°, 30°, 48°) at once."""
 
     def on(self, shape: tuple[int, int], pixel_size: float) -> Views:
         """The views on a detector of `shape` pixels of `pixel_size` [m]; `InputError` unless one way is named."""

@@ -1,8 +1,7 @@
-"""`holosplat align`: where the beams of a scan really are."""
+"""`holosplat align | calibrate`: where the beams of a scan really are, by its matter or by a body of known shape."""
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,30 +10,29 @@ from tyro.conf import Positional
 
 from ..checks import require
 from ..io.reading import Part, Reading
-from ..ranges import ranged
+from ..ranges import Small, ranged
 from .light import Degrees, LightFlags, Pixels, Share
-from .options import PriorOptions
+from .options import MaterialOptions, PriorOptions
 from .places import Output
 from .progress import ProgressBar
 from .room import tell_frames
+from .sentence import put, say
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from ..align import AlignedViews, PoseOptions
+    from ..align import AlignedViews, Calibrated, PoseOptions, PosePrior
     from ..matter import MaterialPrior
-    from ..optics.background import LightOptions
-    from ..scan import Exposures, Scan
+    from ..mesh import TriangleMesh
+    from ..scan import Exposures
 
-LIGHT = LightFlags()
-"""Even, unless the air of frames says otherwise."""
 
 TOML = ".toml"
 
 
 @dataclass(frozen=True)
 @ranged
-class UncertainOptions:
+class PoseFlags:
     """How far off the plan each view may be: standard deviations. 0 keeps it as planned."""
 
     uncertain_shift: Pixels = 2.0
@@ -43,10 +41,34 @@ class UncertainOptions:
     """Turns about the two axes across the beam [degrees]."""
     uncertain_roll: Degrees = 1.0
     """Turns about the beam [degrees]."""
-    uncertain_magnification: Share = 0.0
-    """Magnification, as a share of it; that of all training frames together is as planned."""
     uncertain_distance: Share = 0.0
     """Distance, as a share of it: only where fringes are resolved."""
+
+    def prior(self) -> PosePrior:
+        """The same as a prior of poses."""
+        from ..align import PosePrior
+
+        return PosePrior(self.uncertain_shift, self.uncertain_angle, self.uncertain_roll, self.uncertain_distance)
+
+
+@dataclass(frozen=True)
+@ranged
+class MagnifiedFlags(PoseFlags):
+    """The same, and the magnification."""
+
+    uncertain_magnification: Share = 0.0
+    """Magnification, as a share of it; that of all training frames together is as planned."""
+
+    def prior(self) -> PosePrior:
+        """The same as a prior of poses."""
+        return replace(super().prior(), magnification=self.uncertain_magnification)
+
+
+@dataclass(frozen=True)
+@ranged
+class UncertainOptions(MagnifiedFlags):
+    """How far off the plan each view may be: standard deviations. 0 keeps it as planned."""
+
     drift_shift: Pixels = 0.0
     """Of a series: how far each beam's shifts drift from the first time to the last [pixels]."""
     drift_angle: Degrees = 0.0
@@ -54,43 +76,35 @@ class UncertainOptions:
 
     def options(self) -> PoseOptions:
         """The options of the search."""
-        from ..align import Drift, PoseOptions, PosePrior
+        from ..align import Drift, PoseOptions
 
-        sizes = {name.removeprefix("uncertain_"): value for name, value in vars(self).items() if "drift" not in name}
-        return PoseOptions(PosePrior(**sizes), drift=Drift(self.drift_shift, self.drift_angle))
+        return PoseOptions(self.prior(), drift=Drift(self.drift_shift, self.drift_angle))
 
 
 @dataclass(frozen=True)
 @ranged
-class RefineOptions:
+class RefineOptions(MagnifiedFlags):
     """Beams that may be elsewhere than the scan says."""
 
     refine: str | None = None
     """What is found of each frame beside the matter: shifts, angles, roll, distance, magnification, with commas between
     (default: nothing, the beams are where the scan says)."""
-    uncertain_shift: Pixels = 2.0
-    """Standard deviation of the detector's shifts along rows and columns [pixels]."""
-    uncertain_angle: Degrees = 1.0
-    """Standard deviation of turns about the two axes across the beam [degrees]."""
-    uncertain_roll: Degrees = 1.0
-    """Standard deviation of turns about the beam [degrees]."""
-    uncertain_magnification: Share = 0.01
-    """Standard deviation of the magnification, as a share of it."""
-    uncertain_distance: Share = 0.02
-    """Standard deviation of the distance, as a share of it."""
 
     def options(self) -> PoseOptions | None:
         """The options of the search; None where nothing is to be refined. Errors: `InputError` for other names."""
-        sizes = {name.removeprefix("uncertain_"): value for name, value in vars(self).items() if name != "refine"}
         if self.refine is None:
-            usual = vars(RefineOptions())
+            usual = vars(AS_SAID)
             changed = [name.replace("_", "-") for name, value in vars(self).items() if value != usual[name]]
             require(not changed, f"--{', --'.join(changed)} go with --refine, which says what is uncertain; add it.")
             return None
-        from ..align import PoseOptions, PosePrior
+        from ..align import PoseOptions
         from ..align.geometry import wanted
 
-        return PoseOptions(wanted(self.refine, PosePrior(**sizes)))
+        return PoseOptions(wanted(self.refine, self.prior()))
+
+
+AS_SAID = RefineOptions(uncertain_distance=0.02, uncertain_magnification=0.01)
+"""Beams are where the scan says; how far off they may be where --refine asks for them."""
 
 
 def align(
@@ -100,7 +114,7 @@ def align(
     unknown: UncertainOptions = UncertainOptions(),
     reading: Reading = Reading(),
     *,
-    illumination: LightFlags = LIGHT,
+    illumination: LightFlags = LightFlags(),
     axis_only: bool = False,
     table: Output | None = None,
     geometry_out: Output | None = None,
@@ -116,7 +130,7 @@ def align(
     """
     import numpy as np
 
-    from ..align import AlignedBeams
+    from ..align import AlignedBeams, align_views, find_axis
     from ..io.atomic import require_writable
     from ..io.formats import read_frames
     from ..io.nxtomo import write_scan
@@ -138,9 +152,13 @@ def align(
     prior = matter.prior(measured.exposures.reference_energy)
     errors, frames, missing, lasting = None, measured.source, measured.missing, np.arange(len(measured))
     if axis_only:
-        lines, exposures = _axis(measured, prior, illumination.options())
+        with ProgressBar() as bar:
+            light, show = illumination.options(), bar.of("axis")
+            axis = find_axis(measured, ratio=_ratio(prior), light=light, on_progress=show)
+        lines, exposures = axis.lines(), axis.applied(measured.exposures)
     else:
-        found = _views(measured, prior, how, illumination.options())
+        with ProgressBar() as bar:
+            found = align_views(measured, prior, how, light=illumination.options(), on_progress=bar.show)
         lines, exposures, errors = found.lines(), found.exposures, found.errors
         if isinstance(found, AlignedBeams):
             if any(found.sides):
@@ -149,32 +167,14 @@ def align(
             lasting = lasting if geometry_out is None else found.lasting()
         if table is not None:
             _write_table(table, found)
-    for line in lines:
-        print(line)
+    put(lines)
     if geometry_out is not None:
         told = errors if errors is None else errors[lasting]
         _write_geometry(geometry_out, scan, reading, (measured.exposures[lasting], exposures[lasting]), told, lines[0])
     facts = measured.provenance | {"aligned": lines[0]}
     light = measured.light if frames is measured.source else None  # that of frames which were turned back is not known
     write_scan(out, Scan.of(frames, exposures, measured.is_test, facts, light, missing))
-    print(f"wrote {out}: the same {len(measured)} frames, with other exposures", file=sys.stderr)
-
-
-def _axis(scan: Scan, prior: MaterialPrior, light: LightOptions) -> tuple[list[str], Exposures]:
-    from ..align import find_axis
-
-    with ProgressBar() as bar:
-        show = bar.show
-        axis = find_axis(scan, ratio=_ratio(prior), light=light, on_progress=lambda done: show("axis", done, {}))
-    return axis.lines(), axis.applied(scan.exposures)
-
-
-def _views(scan: Scan, prior: MaterialPrior, options: PoseOptions, light: LightOptions) -> AlignedViews:
-    from ..align import align_views
-
-    with ProgressBar() as bar:
-        show = bar.show
-        return align_views(scan, prior, options, light=light, on_progress=lambda stage, done: show(stage, done, {}))
+    say(f"wrote {out}: the same {len(measured)} frames, with other exposures")
 
 
 def _write_geometry(
@@ -198,7 +198,7 @@ def _write_geometry(
     origin = {"scan": str(source), "aligned": said}
     beams = Beams.of(replace(whole, views=views, distance=found.distance), errors, origin)
     write_beams(path, beams)
-    print(f"wrote {path}: the geometry of {len(beams)} beams, for --exposures", file=sys.stderr)
+    say(f"wrote {path}: the geometry of {len(beams)} beams, for --exposures")
 
 
 def _write_table(path: Path, found: AlignedViews) -> None:
@@ -231,3 +231,82 @@ def _ratio(prior: MaterialPrior) -> float | None:
     if isinstance(prior, Known) and prior.materials[0].beta > 0:
         return prior.materials[0].ratio
     return None
+
+
+@dataclass(frozen=True)
+@ranged
+class BodyOptions:
+    """The known shape: a mesh, or beads."""
+
+    phantom: Path | None = None
+    """Closed mesh of the phantom (.stl, .ply, .obj, .vtk, .vtp, .vtu); its pose in the file does not matter."""
+    length_unit: str = "um"
+    """Unit of the mesh file's coordinates."""
+    beads: Small | None = None
+    """Or: radius of beads [m], of any number, anywhere in the field."""
+
+    def body(self) -> TriangleMesh | float:
+        """The mesh [m], or the radius [m]. Errors: `InputError` unless one of them is given."""
+        from ..io.vtk import read_meshes
+        from ..specimens.repair import closed
+
+        require((self.phantom is None) != (self.beads is None), "give either --phantom FILE or --beads RADIUS.")
+        if self.phantom is None:
+            return self.beads or 0.0
+        require(
+            not self.phantom.is_dir(), f"--phantom must be one file, but {self.phantom} is a folder; name the file."
+        )
+        return closed(read_meshes(self.phantom, self.length_unit)[0], self.length_unit)
+
+
+@dataclass(frozen=True)
+@ranged
+class DoubtOptions(PoseFlags):
+    """How far off the plan each view may be: standard deviations. 0 keeps it as planned."""
+
+    uncertain_pixel: Share = 0.0
+    """Pixel size, as a share of it."""
+
+
+def calibrate(
+    scan: Positional[Path],
+    out: Output,
+    body: BodyOptions,
+    filling: MaterialOptions = MaterialOptions(),
+    unknown: DoubtOptions = DoubtOptions(5.0, 2.0, 2.0, 0.05),
+    reading: Reading = Reading(),
+    *,
+    illumination: LightFlags = LightFlags(),
+) -> None:
+    """Find where beams are by frames of a phantom of known shape, or of beads, for --exposures of other commands.
+
+    Args:
+        scan: Scan of the phantom: a file (NXtomo), or a folder.
+        out: Geometry to write (TOML).
+    """
+    from ..align import CalibrationOptions
+    from ..align import calibrate as find
+    from ..io.atomic import require_writable
+    from ..io.formats import read_frames
+    from ..matter import MaterialPrior
+
+    require_writable(out)
+    whole = reading.part == Part(time_frame=reading.part.time_frame)
+    require(whole, "a geometry is that of whole frames; leave --views, --test-views, --crop and --bin.")
+    require(filling.material is not None, "calibrate needs the phantom's --material; add it.")
+    shape, measured = body.body(), read_frames(scan, reading).in_memory()
+    material = filling.filling().of("", measured.exposures.reference_energy)
+    with ProgressBar() as bar:
+        options, light = CalibrationOptions(unknown.prior(), unknown.uncertain_pixel), illumination.options()
+        found = find(measured, MaterialPrior.known(material), shape, options, light=light, on_progress=bar.show)
+    put(found.lines())
+    _write_beams(out, scan, found)
+    say(f"wrote {out}: the geometry of {len(measured)} beams, for --exposures")
+
+
+def _write_beams(out: Path, scan: Path, found: Calibrated) -> None:
+    from ..io.beams import Beams, write_beams
+
+    beams = Beams.of(found.exposures, found.errors, {"scan": str(scan), "calibrated": found.lines()[0]})
+    size, doubt = found.pixel_size
+    write_beams(out, beams.with_pixel_size(size) if doubt else beams)

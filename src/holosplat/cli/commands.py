@@ -11,28 +11,64 @@ from tyro.conf import Positional, arg
 
 from ..checks import InputError, require
 from ..io.reading import Reading
-from ..ranges import Seed
-from .align import RefineOptions
-from .carried import CarriedFlags
+from ..ranges import Seed, Weight, ranged
+from .align import AS_SAID, RefineOptions
 from .light import RunLightFlags
-from .live import LiveFlags, watched
 from .options import BeamlineOptions, MethodOptions, PriorOptions
 from .places import Output
-from .progress import INTERRUPTED, ProgressBar
+from .progress import ProgressBar
 from .room import tell_frames, tell_reconstruction
-from .sentence import say
-from .truth import TruthOptions
+from .sentence import INTERRUPTED, put, say
+from .simulate import TruthOptions
+from .view import LiveFlags, watched
 
 if TYPE_CHECKING:
     from ..methods import Method
+    from ..motion.flow_reconstruction import FlowOptions
     from ..scan import Scan
     from ..series.plan import Settings
     from ..workflows.evaluate import Evaluation
     from ..workflows.reconstruct import Reconstruction
     from ..workflows.run_folder import RunFolder
 
-LIVE = LiveFlags()
-"""Nobody watches."""
+
+@dataclass(frozen=True)
+@ranged
+class CarriedFlags:
+    """How matter changes between the times of a scan."""
+
+    motion: Literal["still", "each", "flow", "bodies"] | None = None
+    """still: one object for all times; each: a run for each time; flow: one object that a flow carries; bodies: closed
+    bodies on paths, as `track` (default: one time)."""
+    fading: Weight = 0.0
+    """Standard deviation expected of what the logarithm of δ changes by over all times, where matter fades or grows
+    denser (0: it does not). About a third is a change by a third."""
+
+    def applied(self, reading: Reading) -> Reading:
+        """`reading` of the times that --motion needs. Errors: `InputError` where --time-frame is given, too."""
+        if self.motion is None:
+            return reading
+        require(
+            reading.part.time_frame is None,
+            f"--motion {self.motion} takes all times, but --time-frame is {reading.part.time_frame}; leave one.",
+        )
+        taken = {"still": "still", "each": "each", "flow": "all", "bodies": None}[self.motion]
+        return replace(reading, part=replace(reading.part, time_frame=taken))
+
+    def options(self) -> FlowOptions:
+        """The options of the method."""
+        from ..motion.flow_reconstruction import FlowOptions
+
+        return FlowOptions(fading=self.fading)
+
+    def require_all(self, reading: Reading) -> None:
+        """`InputError` where something of it is asked of one time."""
+        require(
+            self.fading == 0 or reading.part.time_frame == "all",
+            "--fading is of matter that a flow carries; add --motion flow, or leave it.",
+        )
+
+
 UNEXPLAINED = 3
 """Exit code of `reconstruct --strict` where frames are not explained."""
 
@@ -45,7 +81,7 @@ class Asked:
     matter: PriorOptions = field(default_factory=PriorOptions)
     how: MethodOptions = field(default_factory=MethodOptions)
     illumination: RunLightFlags = field(default_factory=RunLightFlags)
-    geometry: RefineOptions = field(default_factory=RefineOptions)
+    geometry: RefineOptions = AS_SAID
     motion: CarriedFlags = field(default_factory=CarriedFlags)
 
     def each_time(self, method: Method, reading: Reading, seed: int) -> Settings:
@@ -82,20 +118,16 @@ class Asked:
         return {"matter": kind, "light": light, "uncertain": uncertain, "refine": refine}
 
 
-USUAL = Asked()
-"""What is asked without options."""
-
-
 def reconstruct(
     scan: Positional[Path],
     out: Output,
-    asked: Annotated[Asked, arg(name="")] = USUAL,
+    asked: Annotated[Asked, arg(name="")] = Asked(),
     seed: Seed = 0,
     resume: bool = False,
     reading: Reading = Reading(),
     *,
     strict: bool = False,
-    live: LiveFlags = LIVE,
+    live: LiveFlags = LiveFlags(),
 ) -> None:
     """Reconstruct a scan, by what suits its matter or by a method of your choice, into a run folder.
 
@@ -113,7 +145,7 @@ def reconstruct(
     from ..planning.scan_facts import can_be_seen
     from ..workflows.reconstruct import reconstruct as fit
     from ..workflows.run_folder import RunFolder, claimed
-    from .motion import asks_for_motion, may_go_on, reconstruct_in_motion
+    from .track import asks_for_motion, may_go_on, reconstruct_in_motion
 
     method, reading = asked.how.chosen(), asked.motion.applied(reading)
     asked.motion.require_all(reading)
@@ -145,14 +177,14 @@ def reconstruct(
             told = {"on_progress": follow.on_progress, "on_state": follow.on_state}
             result = fit(measured, prior, method, seed, folder=folder, resume=resume, **ways, **told)
         evaluation, report = _scored(folder, result, measured, scan, reading)
-    _print_scores(evaluation)
+    put(evaluation.lines())
     _print_result(folder, result, report)
     _end(result, out, strict)
 
 
 def _time_by_time(scan: Path, out: Path, asked: Asked, reading: Reading, seed: int, resume: bool) -> None:
     """Bodies followed through all times, or a run for each time."""
-    from .each_time import reconstruct_each
+    from .series import reconstruct_each
     from .track import track
 
     method = asked.how.chosen()
@@ -168,11 +200,11 @@ def _scored(
     folder: RunFolder, result: Reconstruction, measured: Scan, scan: Path, reading: Reading
 ) -> tuple[Evaluation, Path]:
     """The scores of a run on its frames, and its report; the folder then knows where its frames are."""
-    from ..io.run_scan import run_source
+    from ..io.formats import run_source
     from ..report.run import report_run
     from ..workflows.evaluate import evaluate as score
     from ..workflows.reconstruction import instants_of
-    from .motion import report_of_middle
+    from .track import report_of_middle
 
     found = {each.name: each.value for each in result.constants if each.name in reading.told.ranges()}
     folder.write_source(run_source(scan, replace(reading, told=replace(reading.told, **found))))
@@ -201,15 +233,11 @@ def _print_result(folder: RunFolder, result: Reconstruction, report: Path) -> No
 
     if folder.light.is_file():
         say(f"light: {read_json(folder.summary)['light']} ({folder.light})")
-    for constant in result.constants:
-        print(constant.line())
-    for line in result.geometry.lines() if result.geometry else ():
-        print(line)
-    for line in result.choice.lines():
-        print(line)
+    put(constant.line() for constant in result.constants)
+    put(result.geometry.lines() if result.geometry else ())
+    put(result.choice.lines())
     say(f"{sum(result.timing.values()):.1f} s, {result.object.described}; report: {report}")
-    for line in result.verdict.lines("training frames") if result.verdict else ():
-        print(line)
+    put(result.verdict.lines("training frames") if result.verdict else ())
     if result.total:
         print(result.total.words)
 
@@ -262,7 +290,7 @@ def evaluate(
         truth: Volume file of the truth, of any format that export --volume writes.
         as_json: Print JSON instead of a table.
     """
-    from ..io.volume_formats import read_volume_file
+    from ..io.formats import read_volume_file
     from ..report.run import report_run
     from ..workflows.evaluate import evaluate as score
     from ..workflows.evaluate import require_overlap, require_same_field
@@ -281,7 +309,7 @@ def evaluate(
     if as_json:
         print(json.dumps(evaluation.as_dict(), indent=2, allow_nan=False))
     else:
-        _print_scores(evaluation)
+        put(evaluation.lines())
     if instants_of(folder):
         return  # its report is of the time in the middle
     if not folder.is_of(scan_hash(measured)):
@@ -306,7 +334,7 @@ def demo(out: Output = Path("demo")) -> None:
     say(f"wrote {len(paths)} generated red cells to {meshes}")
     detector = "--detector {} {}".format(*DETECTOR)
     say(f"\n$ holosplat simulate {meshes}/*.vtk {detector} --views 16 --psf-sigma-px 0.05 --out {scan} --truth {truth}")
-    beamline = BeamlineOptions(DETECTOR, psf_sigma_px=0.05, views=16)
+    beamline = BeamlineOptions(detector=DETECTOR, psf_sigma_px=0.05, views=16)
     simulate(tuple(paths), beamline=beamline, out=scan, truth=TruthOptions(truth))
     say(f"\n$ holosplat reconstruct {scan} --material haemoglobin --out {run}")
     reconstruct(scan, run, Asked(PriorOptions(("haemoglobin",))))
@@ -334,8 +362,3 @@ def _auto() -> str:
         return f"would take {resolve('auto')}"
     except InputError:
         return "finds neither cpu nor cuda"
-
-
-def _print_scores(evaluation: Evaluation) -> None:
-    for line in evaluation.lines():
-        print(line)

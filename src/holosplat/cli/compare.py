@@ -43,18 +43,14 @@ def _side(path: Path) -> Side:
     """A run with its scores, as far as its scan is still there."""
     from ..io.json import read_json
     from ..io.reading import Part, Reading
-    from ..report.compare import Side
-    from ..workflows.evaluate import evaluate
+    from ..report.compare import side_of
     from ..workflows.reconstruction import instants_of
     from ..workflows.run_folder import RunFolder
-    from .scans import moments_of, run_and_scan
+    from .scans import scan_for
 
-    folder = RunFolder(path)
+    folder, scan = RunFolder(path), None
     folder.require_run()
     told = read_json(folder.source).get("scan") if folder.source.is_file() else None
-    if not told or not Path(str(told)).exists():
-        (one,) = moments_of(folder, None)
-        return Side(folder, one.result, None)
-    reading = Reading(part=Part(time_frame=0)) if instants_of(folder) else Reading()
-    result, scan = run_and_scan(folder, None, reading)
-    return Side(folder, result, evaluate(result, scan, None))
+    if told and Path(str(told)).exists():
+        scan = scan_for(folder, None, Reading(part=Part(time_frame=0)) if instants_of(folder) else Reading())
+    return side_of(folder, scan)

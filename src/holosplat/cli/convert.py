@@ -11,14 +11,12 @@ import torch
 from tyro.conf import Positional, arg
 
 from ..checks import InputError, require
-from ..io.formats import ScanFormat, loader_of, read_as
-from ..io.nerf_synthetic import NerfOptions, grey_range, write_nerf_synthetic
+from ..io.formats import ScanFormat, loader_of, read_as, read_volume_file
+from ..io.images import TiffLayout, write_tiff
+from ..io.nerf_synthetic import NerfOptions, PngKind, grey_range, write_nerf_synthetic
 from ..io.nxtomo import write_scan
-from ..io.png import PngKind
 from ..io.r2_gaussian import R2Options, write_r2_gaussian
 from ..io.reading import Reading
-from ..io.tiff import TiffLayout, write_tiff
-from ..io.volume_formats import read_volume_file
 from ..matter import KnownRatio, MaterialPrior
 from ..methods.method import STAND_IN_RATIO, shows_no_refraction
 from ..optics import retrieve_thickness
@@ -78,7 +76,7 @@ class EveningOptions:
         prior = prior if prior.fixes_ratio else MaterialPrior.of_ratio(STAND_IN_RATIO)
         with ProgressBar() as bar:
             options = FixedPatternOptions(self.still_light, self.inside or 0.0)
-            found = flatfield_corrected(scan, prior, options, lambda stage, fraction: bar.show(stage, fraction, {}))
+            found = flatfield_corrected(scan, prior, options, bar.show)
         say(f"still light: {found.provenance['still_light']}")
         return found
 

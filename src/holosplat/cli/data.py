@@ -1,9 +1,8 @@
-"""The commands `info`, `data`, `materials` and `check`: what files are, samples, named materials, checksums."""
+"""The commands `info`, `data`, `materials`, `check` and `doctor`: files, samples, materials, checksums, versions."""
 
 from __future__ import annotations
 
 import shlex
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -13,6 +12,7 @@ from ..checks import InputError
 from ..io.reading import Reading
 from ..workflows.check import check as look
 from .places import Output, with_checked_arguments
+from .sentence import say
 
 
 def _list() -> None:
@@ -38,13 +38,10 @@ def _fetch(name: Positional[str], folder: Annotated[Path | None, arg(name="from"
 
     wanted = sample(name)
     path, options = fetched(wanted, folder)
-    again = f"$(holosplat data fetch {_again(name, folder)})"
-    print(f"{wanted.facts}\ngo on: {wanted.next.format(data=again)}", file=sys.stderr)
+    words = name if folder is None else f"{name} --from {shlex.quote(str(folder))}"
+    again = f"$(holosplat data fetch {words})"
+    say(f"{wanted.facts}\ngo on: {wanted.next.format(data=again)}")
     print(path, *options)
-
-
-def _again(name: str, folder: Path | None) -> str:
-    return name if folder is None else f"{name} --from {shlex.quote(str(folder))}"
 
 
 def data(
@@ -109,3 +106,19 @@ def info(path: Positional[Path], picture: Output | None = None, reading: Reading
     from ..report.info import info as described
 
     print("\n".join(described(path, reading, picture).lines()))
+
+
+def doctor() -> None:
+    """Look at the installation: versions, kernels, threads, memory, disk, and a small run with its error.
+
+    Exits with 1 where something is wrong, after it has said what to do.
+    """
+    from ..workflows.doctor import checks
+
+    wrong = 0
+    for check in checks():
+        print(check.line(), flush=True)
+        wrong += bool(check.remedy)
+    print("all is well" if not wrong else f"{wrong} of these are wrong; what to do stands below each")
+    if wrong:
+        raise SystemExit(1)

@@ -11,8 +11,10 @@ import re
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
+from functools import cache
 from importlib import import_module
 from io import TextIOWrapper
+from pathlib import Path
 
 import tyro
 
@@ -22,9 +24,9 @@ from ..ranges import checked_later
 from ..version import __version__
 from .help import ALL, CONFIG, HELP, acts_of, overview, page, parser_of
 from .places import with_checked_arguments
-from .progress import INTERRUPTED, end_as_on_interrupt, logged, say_notes
+from .progress import end_as_on_interrupt, logged, say_notes
 from .resume import resumed
-from .sentence import give_up
+from .sentence import INTERRUPTED, give_up, say
 
 LONGEST = 200
 """Characters of another program's message, at most."""
@@ -32,122 +34,56 @@ LONGEST = 200
 EMPTY = re.compile("(--[^=]+)=")
 """An option to which nothing is given."""
 
-_OWN: dict[str, tuple[str, str]] = {
-    "plan": (
-        "plan",
-        "Say what an experiment would see, resolve and store, and where its best distance and energy lie.",
-    ),
-    "materials": (
-        "data",
-        "List the materials that have a name, with density, δ, β and δ/β; formulas need a density instead.",
-    ),
-    "grow": ("grow", "Let red cells flow through a channel, and write their meshes (VTK, µm) at every snapshot."),
-    "simulate": (
-        "simulate",
-        "Simulate the holograms of closed meshes, still or moving (--frame-rate), of a volume, or of generated matter.",
-    ),
-    "record": (
-        "imaging",
-        "Record a noise-free scan as raw counts: pulses of a free-electron laser, a camera, flats and darks.",
-    ),
-    "correct": ("imaging", "Correct raw counts by dark and flat fields into a scan of relative intensities."),
-    "align": ("align", "Find where the beams of a scan really are, and write the same frames with other exposures."),
-    "calibrate": (
-        "calibrate",
-        "Find where beams are by frames of a phantom of known shape, or of beads, for --exposures of other commands.",
-    ),
-    "join": ("imaging", "Join scans of several beams, one file each; pixel sizes, energies and distances may differ."),
-    "retrieve": ("retrieve", "Retrieve phase and thickness of single frames, into TIFF files or HDF5."),
-    "reconstruct": (
-        "commands",
-        "Reconstruct a scan, by what suits its matter or by a method of your choice, into a run folder.",
-    ),
-    "init": (
-        "pipeline",
-        "Print a pipeline file with comments, which you change and run (holosplat init > run.toml).",
-    ),
-    "run": (
-        "pipeline",
-        "Run the stages of a pipeline file (correct, align, reconstruct, export) in order; finished ones are skipped.",
-    ),
-    "track": (
-        "track",
-        "Follow closed bodies through the times of a scan: their shapes on smooth paths, into a run folder.",
-    ),
-    "series": (
-        "series",
-        "Reconstruct a series as tasks of their own: on this machine, by Slurm, on Dask (plan, run, status, collect).",
-    ),
-    "watch": (
-        "watch",
-        "Reconstruct scans as they appear in a folder, each begun with what the last one gave, and keep a live page.",
-    ),
-    "forecast": (
-        "forecast",
-        "Carry a run of track on: its bodies and their frames at later times, with a standard error.",
-    ),
-    "render": ("commands", "Predict the frames of a scan from a run."),
-    "export": (
-        "export",
-        "Write δ and β of a run as a volume, its bodies as meshes, or its object in few bytes or as splats.",
-    ),
-    "view": (
-        "view",
-        "Show a run or an object file in the browser, as Gaussians or surfaces, with sliders (Ctrl-C ends).",
-    ),
-    "surface": (
-        "surface",
-        "Cut the bodies of a run out as closed surfaces, fit these to the frames, and write them as VTK files (µm).",
-    ),
-    "convert": ("convert", "Bring a scan into another format; what SOURCE is, its content says."),
-    "evaluate": (
-        "commands",
-        "Score a run on held-out frames and against the true volume, which then joins its report.",
-    ),
-    "compare": (
-        "compare",
-        "Compare two runs side by side: what was asked, decided and found, and where their volumes differ.",
-    ),
-    "check": (
-        "data",
-        "Say whether a run folder or an HDF5 file is as it was written, by manifest and checksums.",
-    ),
-    "data": ("data", "Sample data of other people: list it, or fetch one into the cache (list, fetch NAME)."),
-    "dataset": (
-        "dataset",
-        "Simulate scenes for learning, drawn at random from stated ranges, into a folder of shards with a datasheet.",
-    ),
-    "train": (
-        "train",
-        "Train a network on scenes of `holosplat dataset`: weights with a card, and curves.",
-    ),
-    "demo": ("commands", "Run the whole chain on generated red cells: simulate, reconstruct, evaluate, report."),
-    "info": (
-        "data",
-        "Say what a file or a run is: shape, beam, angles, air, noise, fringes, what is missing, and what it takes.",
-    ),
-    "doctor": (
-        "doctor",
-        "Look at the installation: versions, kernels, threads, memory, disk, and a small run with its error.",
-    ),
-    "backends": ("commands", "Say which backends can be used here, and what each of them offers."),
+GROUPS: dict[str, dict[str, str]] = {
+    "Data": {
+        "info": "data",
+        "convert": "convert",
+        "correct": "imaging",
+        "join": "imaging",
+        "data": "data",
+        "materials": "data",
+        "check": "data",
+    },
+    "Simulate": {"plan": "plan", "grow": "grow", "simulate": "simulate", "record": "imaging"},
+    "Reconstruct": {
+        "init": "pipeline",
+        "run": "pipeline",
+        "calibrate": "align",
+        "align": "align",
+        "retrieve": "retrieve",
+        "reconstruct": "commands",
+        "track": "track",
+        "surface": "surface",
+    },
+    "Look": {"evaluate": "commands", "view": "view", "export": "export", "render": "commands", "compare": "compare"},
+    "Series": {"series": "series", "watch": "series", "forecast": "forecast"},
+    "Learn": {"dataset": "learn", "train": "learn"},
+    "Benchmark and installation": {"demo": "commands", "doctor": "data", "backends": "commands"},
 }
-COMMANDS = Extended(_OWN, "holosplat.commands")
+"""Heading of the overview → its commands, each with the module that has a function of its name; what other packages add
+stands first under the last."""
+
+
+@cache
+def _source(module: str) -> str:
+    return Path(__file__).with_name(f"{module}.py").read_text(encoding="utf-8")
+
+
+def _summary(name: str, module: str) -> str:
+    """The first paragraph of a command's docstring; its module is read, and not imported."""
+    found = re.search(rf'^def {name}\(.*?"""(.*?)(?:\n\n|""")', _source(module), re.DOTALL | re.MULTILINE)
+    assert found is not None
+    return " ".join(found[1].split())
+
+
+COMMANDS = Extended(
+    {name: (module, _summary(name, module)) for names in GROUPS.values() for name, module in names.items()},
+    "holosplat.commands",
+)
 """Name → (module that has a function of that name, first paragraph of the function's docstring).
 
 Modules are of this package, or of another one that adds commands (docs/adding.md), by their whole names.
 """
-
-GROUPS: dict[str, tuple[str, ...]] = {
-    "Data": ("info", "convert", "correct", "join", "data", "materials", "check"),
-    "Simulate": ("plan", "grow", "simulate", "record"),
-    "Reconstruct": ("init", "run", "calibrate", "align", "retrieve", "reconstruct", "track", "surface"),
-    "Look": ("evaluate", "view", "export", "render", "compare"),
-    "Series": ("series", "watch", "forecast"),
-    "Learn": ("dataset", "train"),
-    "Benchmark and installation": ("demo", "doctor", "backends"),
-}
-"""Heading of the overview → its commands; what other packages add stands first under the last."""
 DESCRIPTION = "Quantitative 3D maps from a handful of X-ray phase-contrast images."
 
 
@@ -190,7 +126,7 @@ def _carry_out(log: ExitStack) -> None:
     except UnicodeError as error:
         give_up(f"a name or text is none in UTF-8: {error}; correct it.")
     except KeyboardInterrupt:
-        print("holosplat: interrupted", file=sys.stderr)
+        say("holosplat: interrupted")
         raise SystemExit(INTERRUPTED) from None
     except BrokenPipeError:  # the reader, such as `head`, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

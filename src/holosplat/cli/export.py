@@ -71,7 +71,7 @@ def export(
             names end with _t0000 and so on, or to one .glb in which the bodies move. Beside HDF5 a .xdmf, beside .vti
             and .vtu a .pvd opens all times in ParaView.
     """
-    from ..io.volume_formats import of_time
+    from ..io.formats import of_time
     from ..io.volumes import REFRACTION
     from ..workflows.reconstruction import instants_of
     from ..workflows.run_folder import RunFolder
@@ -113,7 +113,7 @@ def export(
 
 def _require_suffixes(volume: Path | None, bodies: Path | None, objects: ObjectFiles) -> None:
     """`InputError` for a name of a file whose suffix is of no format, before anything is written."""
-    from ..io.volume_formats import HDF5_SUFFIXES, volume_format
+    from ..io.formats import HDF5_SUFFIXES, volume_format
 
     if volume is not None:
         volume_format(volume, "--volume")
@@ -130,8 +130,8 @@ def _require_suffixes(volume: Path | None, bodies: Path | None, objects: ObjectF
 
 def _require_free(timed: Sequence[Path], every: Sequence[int]) -> None:
     """`InputError` where a file beside those that options name is there already: `timed` ones of `every` time."""
+    from ..io.formats import FORMATS, of_time
     from ..io.provenance import require_free
-    from ..io.volume_formats import FORMATS, of_time
 
     for path in timed:
         for out in [of_time(path, frame) for frame in every] or [path]:
@@ -163,8 +163,7 @@ def _export_series(path: Path, steps: Sequence[tuple[float, Path]], grid: Grid |
 
 def _export_compact(folder: RunFolder, out: Path, step_px: float, together: tuple[Path, ...]) -> None:
     from ..io.compact import steps_of
-    from ..io.objects import write_compact
-    from ..io.series import names_of, write_series
+    from ..io.objects import names_of, write_compact, write_series
     from ..workflows.reconstruct import load_reconstruction
     from ..workflows.run_folder import RunFolder
 
@@ -206,7 +205,7 @@ def _export_motion(folder: RunFolder, out: Path) -> None:
 
 
 def _export_splats(result: Reconstruction, out: Path) -> None:
-    from ..io.splats import write_splats
+    from ..io.solids import write_splats
     from ..representations import GaussianCloud
 
     found = result.object
@@ -246,8 +245,8 @@ def _export_volume(
     voxel_size: float | None,
 ) -> Grid:
     from ..geometry import Grid
+    from ..io.formats import write_volume_file
     from ..io.json import read_json
-    from ..io.volume_formats import write_volume_file
     from ..planning.acts import of_export
     from ..scan import PIXEL_RANGE_M
     from .room import tell

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -11,9 +10,8 @@ import numpy as np
 from tyro.conf import Positional
 
 from ..checks import positive, require
-from ..io.formats import read_frames
+from ..io.formats import read_frames, run_reading, run_source
 from ..io.reading import Reading, Told, ends_of
-from ..io.run_scan import run_reading, run_source
 from ..motion.cell_model import ChannelFrame
 from ..motion.dynamics import DynamicsForecast
 from ..motion.fit import MotionFit
@@ -34,6 +32,7 @@ from ..workflows.track import COLLECTION, TRACKS
 from .places import Output
 from .progress import ProgressBar
 from .room import tell
+from .sentence import put, say
 
 
 @dataclass(frozen=True)
@@ -138,13 +137,12 @@ def forecast(
     with claimed(new):
         done = write_forecast(new, tracked, found, config_of(options, scan, folder.read_config(), seed))
         new.write_source(_source(folder, scan, found, out))
-        for line in found.lines():
-            print(line)
+        put(found.lines())
         last = len(found.forecast.times) - 1
         shown = _shown(scan, found)
         final = reconstruction_at(done, found.forecast.times.tolist(), last)
-        print(f"report: {report_run(new, final, shown, evaluate(final, shown, None), None)}", file=sys.stderr)
-    print(f"wrote {out / COLLECTION}, {out / TRACKS}, {out / FRAMES}, {out / TABLE}", file=sys.stderr)
+        say(f"report: {report_run(new, final, shown, evaluate(final, shown, None), None)}")
+    say(f"wrote {out / COLLECTION}, {out / TRACKS}, {out / FRAMES}, {out / TABLE}")
 
 
 def _whole_scan(folder: RunFolder) -> Scan:

@@ -12,9 +12,9 @@ from ..planning.needs import Needs
 from ..specimens.membrane.resting import nodes_of
 from ..units import in_percent
 from .places import Output
-from .progress import INTERRUPTED, ProgressBar
+from .progress import ProgressBar
 from .room import tell
-from .sentence import say
+from .sentence import interruptible, say
 
 
 def grow(out: Output, what: Growth, resume: bool = False) -> None:
@@ -27,18 +27,18 @@ def grow(out: Output, what: Growth, resume: bool = False) -> None:
     what.check()
     coarser = ((f"--frequency {f}", _needs(replace(what, frequency=f))) for f in range(what.frequency - 1, 2, -1))
     tell("grow", _needs(what), out, coarser)
-    try:
-        with sole_writer(out), ProgressBar() as bar:
-            grown = run(what, out, resume, lambda fraction: bar.show("cells in flow", fraction, {}))
-    except KeyboardInterrupt:
-        begun = SeriesFolder(out).state.is_file()
-        say(f"interrupted; {'snapshots so far stay in' if begun else 'no snapshot yet in'} {out}; go on with --resume")
-        raise SystemExit(INTERRUPTED) from None
+    with interruptible(lambda: _cut_off(SeriesFolder(out))), sole_writer(out), ProgressBar() as bar:
+        grown = run(what, out, resume, bar.of("cells in flow"))
     say(
         f"wrote {SeriesFolder(out).collection}: {grown.snapshots} snapshots of {what.cells} cells, "
         f"{what.period:.4g} s apart; {grown.state.taken} steps, {grown.state.refused} refused; "
         f"volume within {in_percent(grown.volume)}, area within {in_percent(grown.area)}"
     )
+
+
+def _cut_off(folder: SeriesFolder) -> str:
+    kept = "snapshots so far stay in" if folder.state.is_file() else "no snapshot yet in"
+    return f"interrupted; {kept} {folder.path}; go on with --resume"
 
 
 def _needs(what: Growth) -> Needs:

@@ -44,11 +44,7 @@ def record(
         truth: Also write what the frames do not say: light, pulse energies, gains and defects (HDF5).
     """
     with ProgressBar() as bar:
-        done = record_file(
-            *(scan, out, what, camera, light, truth),
-            on_progress=lambda fraction: bar.show("recording frames", fraction, {}),
-            part=part,
-        )
+        done = record_file(scan, out, what, camera, light, truth, on_progress=bar.of("recording frames"), part=part)
     say(
         f"wrote {out}: {done.projections} projections, {done.flats} flats and {done.darks} darks, {camera.bits} bits, "
         f"{done.gain:.4g} counts a photon, {done.defects} defective pixels"
@@ -67,7 +63,7 @@ def correct(raw: Positional[Path], out: Output, how: CorrectionOptions, reading:
         out: Scan file to write (NXtomo).
     """
     with ProgressBar() as bar:
-        done = correct_file(raw, out, how, lambda fraction: bar.show("correcting frames", fraction, {}), reading)
+        done = correct_file(raw, out, how, bar.of("correcting frames"), reading)
     flat = f"flat fields of {done.components} components" if done.method == "dynamic" else "the mean flat field"
     say(f"wrote {out}: {done.frames} frames by {flat}, normalised: {done.normalised}")
     say(_levels(done, how.normalise is not None or bool(how.air)))
@@ -117,8 +113,6 @@ def join(
         exposures: Where the frames are, in their order (geometry.toml of align or calibrate), whatever the files say.
     """
     with ProgressBar() as bar:
-        joined = join_files(
-            scans, out, pixel_size, flip, lambda fraction: bar.show("joining frames", fraction, {}), part, exposures
-        )
+        joined = join_files(scans, out, pixel_size, flip, bar.of("joining frames"), part, exposures)
     rows, columns = joined.views.shape
     say(f"wrote {out}: {len(joined)} frames of {rows} × {columns} pixels of {span(1e6 * joined.views.pixel_sizes)} µm")

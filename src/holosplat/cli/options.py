@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import UseAppendAction, arg
 
 from ..beamline.light import UnevenLight
-from ..beamline.misalignment import Directions, Geometry
+from ..beamline.misalignment import Directions
 from ..checks import InputError, require
 from ..io.reading import ends_of
 from ..ranges import (
@@ -102,9 +102,9 @@ class MaterialOptions:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 @ranged
-class BeamlineOptions:
+class BeamlineOptions(Directions):
     """Beam, detector and views."""
 
     detector: tuple[Natural, Natural]
@@ -117,16 +117,6 @@ class BeamlineOptions:
     """Effective pixel size [m]."""
     psf_sigma_px: Pixels = 0.0
     """Standard deviation of the Gaussian point-spread function [pixels]."""
-    views: Many | None = None
-    """Number of views, evenly spaced over 180°."""
-    angles_deg: tuple[Signed, ...] = ()
-    """Or: the views' angles [degrees]."""
-    tilts_deg: tuple[Signed, ...] = ()
-    """With these: how far each view leaves the plane normal to the axis [degrees]."""
-    rotations: Path | None = None
-    """Or: a .npy file of rotation matrices [V, 3, 3], x_lab = R x_obj."""
-    geometry: Geometry | None = None
-    """Or: a known geometry: 16 even views, or two beams (0°, 23.8°) or three (0°, 30°, 48°) at once."""
     exposures: Path | None = None
     """Or: geometry.toml of align or calibrate, with the views, and the distances, energies and pixels that it says."""
     test_every: int = 4
@@ -154,16 +144,13 @@ class BeamlineOptions:
             from ..geometry import Views
             from ..io.beams import read_beams
 
-            others = [self.views, self.angles_deg or None, self.tilts_deg or None, self.rotations, self.geometry]
-            require(
-                others == [None] * len(others), "--exposures says where views are; leave the other options of views."
-            )
+            others = (getattr(self, one.name) != one.default for one in fields(Directions))
+            require(not any(others), "--exposures says where views are; leave the other options of views.")
             beams = read_beams(self.exposures)
             rotations = np.array([each.matrix() for each in beams.view])
             views = Views.from_rotations(rotations, self.detector, self.pixel_size)
             return beams.on(Exposures.of(views, self.energy_kev, self.distance, self.psf_sigma_px))
-        directions = Directions(self.views, self.angles_deg, self.tilts_deg, self.rotations, self.geometry)
-        views = directions.on(self.detector, self.pixel_size)
+        views = self.on(self.detector, self.pixel_size)
         return Exposures.of(views, self.energy_kev, self.distance, self.psf_sigma_px)
 
     def split(self, count: int) -> np.ndarray:

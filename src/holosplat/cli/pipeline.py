@@ -63,7 +63,11 @@ class Stage:
     def state(self) -> str:
         """new: no output is there; done: all are, whole, and made by this command from the same input; begun: some are,
         or not whole; other: another command or input made one of them."""
-        there = [path for out in self.outputs() for path in ([out.path] if _is_taken(out) else of_times(out.path))]
+        there = [
+            path
+            for out in self.outputs()
+            for path in ([out.path] if out.is_there() and is_taken(out.path) else of_times(out.path))
+        ]
         if not there:
             return "new"
         if not all(is_made_by(path, self.words) for path in there):
@@ -90,7 +94,9 @@ class Stage:
         whole = out.is_there() or self.name != "export"
         files = [out.path] if whole else of_times(out.path)
         wanted = 1 if whole else len(instants_of(RunFolder(self.given.arguments["run"])))
-        return 0 < len(files) == wanted and all(file.exists() and not _is_damaged(file) for file in files)
+        return 0 < len(files) == wanted and all(
+            file.exists() and not (is_hdf5(file) and check(file)[1]) for file in files
+        )
 
     @property
     def _can_resume(self) -> bool:
@@ -115,16 +121,6 @@ class Stage:
         given.arguments |= more
         with _typed(words):
             self.function(*given.args, **given.kwargs)
-
-
-def _is_taken(out: Place) -> bool:
-    return out.is_there() and is_taken(out.path)
-
-
-def _is_damaged(path: Path) -> bool:
-    from ..workflows.check import check
-
-    return is_hdf5(path) and bool(check(path)[1])
 
 
 def init(everything: Annotated[bool, arg(name="all")] = False) -> None:

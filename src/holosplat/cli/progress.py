@@ -10,22 +10,22 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from functools import partial
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import FrameType, MappingProxyType, TracebackType
 from typing import TYPE_CHECKING, Any, TextIO
 
 from ..checks import InputError, require
 from ..io.atomic import require_parent
+from ..progress import Advance
 from ..version import __version__
 from .places import Place, require_apart
 
 if TYPE_CHECKING:
     from tqdm import tqdm
 
-INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it."""
 TOLD = 0.03
 """Share of what was left at first that must be done before the time left is said."""
 STEP, SHORTEST_S, LONGEST_S = 0.05, 2.0, 60.0
@@ -75,7 +75,11 @@ class ProgressBar:
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self._close()
 
-    def show(self, stage: str, fraction: float, record: dict[str, float]) -> None:
+    def of(self, stage: str) -> Advance:
+        """What shows how far the stage is."""
+        return partial(self.show, stage)
+
+    def show(self, stage: str, fraction: float, record: Mapping[str, float] = MappingProxyType({})) -> None:
         """Stage `stage` is done to `fraction`; the fit's last `record` adds loss, count and steps a second.
 
         The time left goes by the mean speed since the stage was first shown, from where it then was: what is resumed
@@ -162,7 +166,7 @@ _FORMAT = "{desc:28s} {percentage:3.0f}%|{bar:24}| {elapsed}{postfix}"
 _WITH_LEFT = _FORMAT.replace("{elapsed}", "{elapsed}, {remaining} left")
 
 
-def _described(record: dict[str, float]) -> str:
+def _described(record: Mapping[str, float]) -> str:
     speed = record["step"] / record["seconds"] if record["seconds"] > 0 else 0.0
     size = f"{record['count']:.0f} Gaussians, " if "count" in record else ""
     return f"loss {record['loss']:.3e}, {size}{speed:.1f} steps/s"

@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 STAND_IN_DELTA = 1e-6
 """δ where only δ/β is known: the phase does not depend on it."""
 
-LIGHT = LightFlags()
-"""Even, unless the air of frames says otherwise."""
 
 RetrievalName = Literal["tikhonov", "admm", "ctf", "paganin", "gerchberg-saxton", "hybrid-input-output"]
 
@@ -66,7 +64,7 @@ def retrieve(
     out: Output,
     matter: OneMaterial = OneMaterial(),
     method: RetrievalName = "tikhonov",
-    illumination: LightFlags = LIGHT,
+    illumination: LightFlags = LightFlags(),
     reading: Reading = Reading(),
 ) -> None:
     """Retrieve phase and thickness of single frames, into TIFF files or HDF5.
@@ -82,15 +80,8 @@ def retrieve(
     measured = read_frames(scan, reading).in_memory()
     material, level = matter.at(measured.exposures.reference_energy)
     with ProgressBar() as bar:
-        found = act(
-            measured.frames,
-            measured.exposures,
-            material,
-            method,
-            light=illumination.options(),
-            missing=measured.missing,
-            on_progress=lambda fraction: bar.show("phase retrieval", fraction, {}),
-        )
+        how = {"light": illumination.options(), "missing": measured.missing, "on_progress": bar.of("phase retrieval")}
+        found = act(measured.frames, measured.exposures, material, method, **how)
     words = found.light.in_words
     maps = {"phase": found.phase.numpy()}
     if level:

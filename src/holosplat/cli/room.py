@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from .sentence import say
 
 if TYPE_CHECKING:
     from ..matter import MaterialPrior, MatterKind
@@ -57,7 +58,7 @@ def tell(what: str, needs: Needs, out: Path, others: Iterable[tuple[str, Needs]]
     from ..planning.needs import require_room
 
     require_room(needs, out, others)
-    print(f"{what} {needs.line()}", file=sys.stderr)
+    say(f"{what} {needs.line()}")
 
 
 def tell_frames(what: str, exposures: Exposures, out: Path, of: Callable[[Exposures], Needs]) -> None:

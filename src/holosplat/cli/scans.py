@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Literal
 
 from ..checks import require
-from ..io.formats import read_frames
+from ..io.formats import read_frames, run_reading
 from ..io.reading import Reading, at_time
-from ..io.run_scan import run_reading
 from ..mesh import TriangleMesh
 from ..representations import InMotion, MovingSurfaces, SurfaceMesh
 from ..scan import Scan

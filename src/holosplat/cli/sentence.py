@@ -3,12 +3,33 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import NoReturn
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it."""
+
+
+def put(lines: Iterable[str]) -> None:
+    """Print lines on standard output."""
+    for line in lines:
+        print(line)
 
 
 def say(text: str) -> None:
     """Print `text` on standard error."""
     print(text, file=sys.stderr)
+
+
+@contextmanager
+def interruptible(sentence: Callable[[], str]) -> Iterator[None]:
+    """In the block, Ctrl-C says a `sentence`, and ends with `INTERRUPTED`."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        say(sentence())
+        raise SystemExit(INTERRUPTED) from None
 
 
 def give_up(sentence: str) -> NoReturn:

@@ -1,27 +1,33 @@
-"""`holosplat series`: many times as tasks of their own, on this machine, by Slurm, or on a Dask cluster."""
+"""`holosplat series | watch`: many times as tasks of their own, here, by Slurm or on Dask, and scans as they appear."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg, subcommand
 
 from ..checks import require
+from ..io.formats import read_frames
 from ..io.reading import Reading
+from ..matter import MaterialPrior
 from ..ranges import Jobs, Positive, Seed, ranged
-from ..series.plan import Cut, Slurm
+from ..series.collect import collect as join
+from ..series.folder import Row, SeriesFolder, line_of, some, table_of, time_left
+from ..series.plan import Cut, Settings, Slurm, Warm, plan_series
+from ..series.run import run_left
+from ..series.watch import Watch, WatchFolder, Watching
+from ..tables import to_table
 from .light import RunLightFlags
 from .options import MethodOptions, PriorOptions
-from .places import Output, with_checked_arguments
-from .progress import INTERRUPTED
-from .sentence import say
+from .places import Kept, Output, with_checked_arguments
+from .room import tell_each_time
+from .sentence import interruptible, put, say
 from .track import BodyFlags, MotionFlags
 
 if TYPE_CHECKING:
-    from ..series.folder import Row, SeriesFolder
-    from ..series.plan import Settings
     from ..series.run import Counts
 
 UNFINISHED = 4
@@ -54,8 +60,6 @@ class Act:
 
     def settings(self, track: bool, seed: int) -> Settings:
         """The settings of each task; `InputError` for options of the other act."""
-        from ..series.plan import Settings, Warm
-
         stray = _changed(self.motion, self.known) if not track else _changed(self.how)
         other = "goes with --track" if not track else "is of reconstruct; leave it, or --track"
         require(not stray, f"--{stray[0].replace('_', '-') if stray else ''} {other}.")
@@ -64,10 +68,6 @@ class Act:
             return Settings("track", motion=replace(self.motion.options(), body=self.known.known()), **shared)
         warm = Warm(self.each.warm, self.each.worse)
         return Settings("reconstruct", self.how.chosen(), self.how.kind_of_matter(), warm, **shared)
-
-
-ACT, WINDOWS = Act(), Cut()
-"""What is done without options."""
 
 
 def _changed(*groups: object) -> list[str]:
@@ -98,16 +98,12 @@ class SlurmFlags(Slurm):
         say(f"submit it by: sbatch {folder.script}")
 
 
-NO_SLURM = SlurmFlags()
-"""It is not asked for."""
-
-
 def plan(
     scans: Positional[tuple[Path, ...]],
     out: Output,
-    windows: Cut = WINDOWS,
+    windows: Cut = Cut(),
     matter: PriorOptions = PriorOptions(),
-    act: Annotated[Act, arg(name="")] = ACT,
+    act: Annotated[Act, arg(name="")] = Act(),
     reading: Reading = Reading(),
     *,
     seed: Seed = 0,
@@ -122,8 +118,6 @@ def plan(
         seed: Seed of everything random.
         track: Follow closed bodies through all times of a task, as holosplat track does; else each is reconstructed.
     """
-    from ..series.folder import SeriesFolder
-    from ..series.plan import plan_series
     from ..series.watch import listed
 
     require(not matter.ranges(), "a series needs one number for --delta-beta; find it by reconstruct of one time.")
@@ -141,7 +135,7 @@ def run(
     jobs: Jobs = 0,
     retry: bool = False,
     dask: str | None = None,
-    cluster: SlurmFlags = NO_SLURM,
+    cluster: SlurmFlags = SlurmFlags(),
     allow_external: bool = False,
 ) -> None:
     """Do one task of a series, or all that are left; what is done already is not done again.
@@ -157,8 +151,7 @@ def run(
         dask: Or: all that are left, on the Dask cluster whose scheduler has this address, such as tcp://host:8786.
         allow_external: The plan says --allow-external, and you trust the folder and its scans.
     """
-    from ..series.folder import SeriesFolder
-    from ..series.run import counted, run_left, run_processes
+    from ..series.run import counted, run_processes
     from ..series.task import run_task
 
     ways = [task is not None, jobs != 0, dask is not None, cluster.slurm or cluster.submit]
@@ -173,7 +166,7 @@ def run(
     if cluster.slurm or cluster.submit:
         cluster.carry_out(series, retry)
         return
-    try:
+    with interruptible(lambda: f"interrupted; what {folder} holds is whole, and the same command goes on from there"):
         if task is not None and cluster.block > 1:
             counts = run_left(series, retry, _tell_row, among=range(task, task + cluster.block))
         elif task is not None:
@@ -186,15 +179,10 @@ def run(
             counts = run_processes(series, jobs, retry)
         else:
             counts = run_left(series, retry, _tell_row)
-    except KeyboardInterrupt:
-        say(f"interrupted; what {folder} holds is whole, and the same command goes on from there")
-        raise SystemExit(INTERRUPTED) from None
     _end(series, counts)
 
 
 def _tell_row(row: Row) -> None:
-    from ..series.folder import line_of
-
     say(line_of(row))
 
 
@@ -212,12 +200,10 @@ def status(folder: Positional[Path]) -> None:
     Args:
         folder: Folder of the series.
     """
-    from ..series.folder import SeriesFolder, table_of, time_left
     from ..series.run import states
 
     found = states(SeriesFolder(folder))
-    for line in table_of(found):
-        print(line)
+    put(table_of(found))
     print(time_left(found))
 
 
@@ -229,9 +215,6 @@ def collect(folder: Positional[Path]) -> None:
     Args:
         folder: Folder of the series.
     """
-    from ..series.collect import collect as join
-    from ..series.folder import SeriesFolder, some
-
     found = join(series := SeriesFolder(folder))
     for path in (series.table, series.bodies, series.page):
         say(f"wrote {path}")
@@ -250,3 +233,75 @@ def series(
     ],
 ) -> None:
     """Reconstruct a series as tasks of their own: on this machine, by Slurm, on Dask (plan, run, status, collect)."""
+
+
+def reconstruct_each(
+    scan: Path,
+    out: Path,
+    settings: Settings,
+    prior: Callable[[float], MaterialPrior],
+    reading: Reading,
+    resume: bool,
+) -> None:
+    """Make the series of all times of `scan` in the folder `out`, in this process, and its table and page.
+
+    It is what `series plan`, `run` and `collect` make of it, as one task. resume: go on with a folder that was begun.
+    Errors: `InputError` for a folder that is not of this, and what `plan_series` refuses.
+    """
+    reading = replace(reading, part=replace(reading.part, time_frame=None))
+    every = plan_series([scan], settings, prior, reading, Cut())
+    planned = replace(every, cut=Cut(window=len(every.moments())))
+    seen, method, matter = read_frames(scan, reading), settings.method, settings.matter
+    tell_each_time(seen.exposures[~seen.is_test], out, method, matter)
+    folder = SeriesFolder(out)
+    if resume and out.exists():
+        require(
+            folder.plan() == planned,
+            f"{out} must be of the same scan and options to go on, but is not; leave --resume, choose another --out.",
+        )
+    else:
+        folder.create(planned)
+    with interruptible(lambda: f"interrupted; go on with --out {out} --resume"):
+        counts = run_left(folder, retry=True, on_row=_tell_row)
+    join(folder)
+    say(f"wrote {folder.table}, {folder.page}; each time is a run folder in {folder.task(0)}")
+    if counts.failed or counts.left:
+        raise SystemExit(UNFINISHED)
+
+
+def watch(
+    folder: Positional[Path],
+    out: Kept,
+    how: Watching = Watching(),
+    each: EachTime = EachTime(),
+    matter: PriorOptions = PriorOptions(),
+    method: MethodOptions = MethodOptions(),
+    reading: Reading = Reading(),
+    *,
+    illumination: RunLightFlags = RunLightFlags(),
+    seed: Seed = 0,
+) -> None:
+    """Reconstruct scans as they appear in a folder, each begun with what the last one gave, and keep a live page.
+
+    The page is OUT/live.html, which a browser opens without a server. Ctrl-C ends the watch, and the same command goes
+    on where it was.
+
+    Args:
+        folder: Folder to watch; files in it, not those of folders in it.
+        out: Folder of the results, new or to go on with.
+        seed: Seed of everything random.
+    """
+    require(not matter.ranges(), "a watch needs one number for --delta-beta; find it by reconstruct of one scan.")
+    require(reading.part.time_frame is None, "a watch takes all times of a scan; choose some with --time-frames.")
+    settings = Act(each, method, illumination=illumination).settings(track=False, seed=seed)
+    said = {
+        "folder": str(folder.resolve()),
+        "settings": to_table(settings.as_table()),
+        "matter": asdict(matter),
+        "reading": reading.as_table(),
+    }
+    result = WatchFolder(out)
+    say(f"watching {folder}; the page is {result.page}; Ctrl-C ends")
+    with interruptible(lambda: f"ended; what {out} holds is whole, and the same command goes on from there"):
+        count = Watch(folder, result, settings, matter.prior, reading, how, say).run(said)
+    say(f"ended after {count} scan(s)")

@@ -12,9 +12,9 @@ from tyro.conf import Positional
 
 from ..checks import require
 from ..io.atomic import atomic_folder
+from ..io.formats import read_volume_file
 from ..io.json import write_json
 from ..io.reading import Reading
-from ..io.volume_formats import read_volume_file
 from ..io.vtk import write_mesh
 from ..mesh import TriangleMesh
 from ..methods.surface_fit import SurfaceOptions, oversampling

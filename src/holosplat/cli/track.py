@@ -2,31 +2,37 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 from tyro.conf import Positional
 
 from ..bodies.rest_shape import KnownBody
 from ..checks import positive, require
-from ..io.formats import read_frames
+from ..io.formats import read_frames, run_source
 from ..io.reading import Reading
-from ..io.run_scan import run_source
+from ..matter import KnownSeveral, MaterialPrior, MatterKind
+from ..methods import Auto, Method
+from ..motion.flow_reconstruction import FlowOptions
 from ..motion.known import beam_directions
 from ..motion.track import TrackOptions
-from ..planning.acts import of_track
+from ..optics.background import LightOptions
+from ..planning.acts import of_motion, of_track
 from ..ranges import Metres, Seed, Share, Weight, ranged
 from ..report.run import report_run
+from ..scan import Scan
 from ..workflows.evaluate import evaluate as score
+from ..workflows.reconstruction import Reconstruction, reconstruction_at
 from ..workflows.run_folder import RunFolder, claimed
-from ..workflows.track import BODIES, COLLECTION, TRACKS
+from ..workflows.track import BODIES, COLLECTION, TRACKS, begun_in_motion, reconstruct_moving
 from ..workflows.track import track as follow
 from .light import LightFlags
 from .options import PriorOptions
 from .places import Output
-from .progress import INTERRUPTED, ProgressBar
+from .progress import ProgressBar
 from .room import tell_frames
+from .sentence import interruptible, put, say
 
 
 @dataclass(frozen=True)
@@ -111,25 +117,17 @@ class MotionFlags:
         )
 
 
-USUAL = MotionFlags()
-"""As the method has it."""
-LIGHT = LightFlags()
-"""Even, unless the air of frames says otherwise."""
-UNKNOWN = BodyFlags()
-"""Nothing."""
-
-
 def track(
     scan: Positional[Path],
     out: Output,
     matter: PriorOptions = PriorOptions(),
-    how: MotionFlags = USUAL,
+    how: MotionFlags = MotionFlags(),
     seed: Seed = 0,
     resume: bool = False,
     reading: Reading = Reading(),
     *,
-    illumination: LightFlags = LIGHT,
-    known: BodyFlags = UNKNOWN,
+    illumination: LightFlags = LightFlags(),
+    known: BodyFlags = BodyFlags(),
 ) -> None:
     """Follow closed bodies through the times of a scan: their shapes on smooth paths, into a run folder.
 
@@ -149,36 +147,94 @@ def track(
     tell_frames("track", measured.exposures[~measured.is_test], out, lambda seen: of_track(seen, options))
     measured = measured.in_memory()
     if options.body is None and len(beam_directions(measured.train().views)) == 2:
-        print(
+        say(
             "note: two beams leave the shapes of bodies open; where their shape at rest is known, --body red-cell or "
-            "--body FILE helps.",
-            file=sys.stderr,
+            "--body FILE helps."
         )
     prior = matter.prior(measured.exposures.reference_energy)
-    try:
-        with ProgressBar() as bar:
-            result = follow(
-                measured,
-                prior,
-                options,
-                seed,
-                light=illumination.options(),
-                folder=folder,
-                resume=resume,
-                on_progress=bar.show,
-            )
-    except KeyboardInterrupt:
-        begun = folder.checkpoint.is_file()
-        print(f"interrupted{f'; go on with --out {out} --resume' if begun else ''}", file=sys.stderr)
-        raise SystemExit(INTERRUPTED) from None
+    with interruptible(lambda: _cut_off(folder)), ProgressBar() as bar:
+        told = {"light": illumination.options(), "folder": folder, "resume": resume, "on_progress": bar.show}
+        result = follow(measured, prior, options, seed, **told)
     with claimed(folder):
         folder.write_source(run_source(scan, reading))
         evaluation = score(result, measured, None)
         report = report_run(folder, result, measured, evaluation, None)
-    for line in (*evaluation.lines(), *result.choice.lines()):
-        print(line)
-    for line in result.verdict.lines("training frames") if result.verdict else ():
-        print(line)
+    put((*evaluation.lines(), *result.choice.lines()))
+    put(result.verdict.lines("training frames") if result.verdict else ())
     seconds = sum(result.timing.values())
-    print(f"{seconds:.1f} s, {result.object.described}; report: {report}", file=sys.stderr)
-    print(f"wrote {out / COLLECTION} ({BODIES}/), {out / TRACKS}", file=sys.stderr)
+    say(f"{seconds:.1f} s, {result.object.described}; report: {report}")
+    say(f"wrote {out / COLLECTION} ({BODIES}/), {out / TRACKS}")
+
+
+def _cut_off(folder: RunFolder) -> str:
+    return f"interrupted{f'; go on with --out {folder.path} --resume' if folder.checkpoint.is_file() else ''}"
+
+
+FEWEST_TIMES = 3
+"""Times from which on matter in motion can be found."""
+
+
+def asks_for_motion(reading: Reading, method: Method, matter: MatterKind | None, plain: bool) -> bool:
+    """Whether --motion flow is to find motion: where the method is left to the program, matter is not said to have
+    levels, and nothing else is asked for (`plain`)."""
+    return reading.part.time_frame == "all" and isinstance(method, Auto) and matter != "levels" and plain
+
+
+def may_go_on(folder: RunFolder, resume: bool) -> bool:
+    """Whether a run in motion may be in `folder`, or begin there; not where one of another kind is to go on."""
+    return not resume or not folder.config.is_file() or begun_in_motion(folder)
+
+
+def reconstruct_in_motion(
+    scan: Path,
+    reading: Reading,
+    prior: MaterialPrior,
+    folder: RunFolder,
+    how: tuple[int, LightOptions, FlowOptions],
+    *,
+    resume: bool = False,
+) -> bool:
+    """Find matter in motion, write its run, its report and its scores; False where nothing moves, or times are few.
+
+    how: the seed, what is assumed of the light, and how matter moves.
+    """
+    seed, light, options = how
+    reading = replace(reading, part=replace(reading.part, time_frame=None))
+    planned = read_frames(scan, replace(reading, told=reading.told.at_middle()))
+    train = planned.exposures[~planned.is_test]
+    count = len(np.unique(train.time))
+    if isinstance(prior, KnownSeveral):
+        return _still("a flow carries one material, but several are known, and motion is not asked of the frames")
+    if count < FEWEST_TIMES:
+        return _still(f"motion is asked of frames of {FEWEST_TIMES} times or more, but there are {count}")
+    tell_frames("matter in motion", train, folder.path, lambda seen: of_motion(seen, options))
+    measured = planned.in_memory()
+    with interruptible(lambda: _cut_off(folder)), ProgressBar() as bar:
+        told = {"light": light, "folder": folder, "resume": resume, "on_progress": bar.show}
+        found = reconstruct_moving(measured, prior, options, seed, **told)
+    if found is None:
+        return _still("nothing moves, as far as the frames tell")
+    result = found.reconstruction
+    folder.write_source(run_source(scan, reading))
+    evaluation, report = score(result, measured, None), report_of_middle(folder, result, measured)
+    put((*evaluation.lines(), *(result.verdict.lines("training frames") if result.verdict else ())))
+    seconds = sum(result.timing.values())
+    for line in (*found.history, *(each.line for each in result.choice.decisions)):
+        say(line)
+    say(f"{seconds:.1f} s, {result.object.described}; report: {report}")
+    return True
+
+
+def _still(why: str) -> bool:
+    say(f"{why}: they are taken as of one time")
+    return False
+
+
+def report_of_middle(folder: RunFolder, result: Reconstruction, measured: Scan) -> Path:
+    """The report of a run of several times at the one in the middle."""
+    times = measured.train().instants.tolist()
+    middle = len(times) // 2
+    shown = measured[(measured.exposures.time == times[middle]).nonzero()[0]].as_static()
+    now = reconstruction_at(result, times, middle)
+    whole = f"This is the time {1e6 * times[middle]:.4g} µs, of {len(measured)} frames of {len(times)} times in all."
+    return report_run(folder, now, shown, score(now, shown, None), None, whole)

@@ -1,7 +1,13 @@
-"""Frames as plain arrays: a NumPy archive (.npz), or an HDF5 file with datasets at its top.
+"""Projections, flats and darks as arrays apart: plain ones, or those of data exchange.
 
-`counts` [N, H, W] are projections, `flats` and `darks` [n, H, W] (or [H, W]) what corrects them, `angles_deg` [N] the
-angles; `energy_kev`, `distance` and `pixel_size` [m] may stand beside them.
+Plain arrays are a NumPy archive (.npz), or an HDF5 file with datasets at its top: `counts` [N, H, W] are projections,
+`flats` and `darks` [n, H, W] (or [H, W]) what corrects them, `angles_deg` [N] the angles; `energy_kev`, `distance` and
+`pixel_size` [m] may stand beside them.
+
+Data-exchange files of the Advanced Photon Source and its neighbours (HDF5) have the layout of De Carlo et al. (2014),
+Journal of Synchrotron Radiation 21, 1224: `/exchange/data` [N, H, W], `data_white`, `data_dark`, and `theta` [N], in
+degrees unless its unit says radians. What stands in `/measurement` is read where it is there: the energy of the
+monochromator, the distance, the pixel size in the sample's plane.
 """
 
 from __future__ import annotations
@@ -16,21 +22,10 @@ import h5py
 import numpy as np
 
 from ..checks import require
+from ..units import ANGLE_UNITS, ENERGY_UNITS, LENGTH_UNITS
 from .guard import read_archive
 from .hdf5 import Fields, open_hdf5
-from .raw_file import (
-    DARK,
-    FLAT,
-    NOTHING,
-    PROJECTION,
-    RANGES,
-    RAW_TAKES,
-    Loader,
-    ScanFile,
-    Stack,
-    exposures_of,
-    together,
-)
+from .raw_file import DARK, FLAT, NOTHING, PROJECTION, RANGES, RAW_TAKES, Loader, ScanFile, Stack
 from .stored_frames import reader
 
 FRAMES = ("counts", "projections", "proj", "data")
@@ -51,13 +46,9 @@ def open_arrays(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Iterato
     with _arrays(source) as arrays:
         frames, flats, darks, angles = (_first(arrays, names) for names in (FRAMES, FLATS, DARKS, ANGLES))
         parts = [(PROJECTION, _stack(frames)), (FLAT, _stack(flats)), (DARK, _stack(darks))]
-        stacks, kinds = together(str(path), parts)
-        projections = kinds == PROJECTION
         found: dict[str, Any] = {} if angles is None else {"angles_deg": np.asarray(angles)}
-        found |= {name: _number(f"{path}: {name}", arrays[name]) for name in RANGES if name in arrays}
-        exposures = exposures_of(str(path), given, found, stacks[0].shape[1:], projections)  # type: ignore[arg-type]
-        nothing_held_out = np.zeros(int(projections.sum()), dtype=bool)
-        yield ScanFile(source, str(path), stacks, kinds, exposures, nothing_held_out, kinds_label=str(path))
+        found |= {name: _one_number(f"{path}: {name}", arrays[name]) for name in RANGES if name in arrays}
+        yield ScanFile.of(source, parts, given, found)
 
 
 @contextmanager
@@ -83,7 +74,7 @@ def _first(arrays: Mapping[str, Any], names: tuple[str, ...]) -> Any:
     return next((arrays[name] for name in names if name in arrays), None)
 
 
-def _number(label: str, array: Any) -> float:
+def _one_number(label: str, array: Any) -> float:
     require(array.size == 1, f"{label} must be one number, but there are {array.size}; keep one.")
     return float(array[()].reshape(-1)[0])
 
@@ -95,8 +86,10 @@ def _stack(frames: Any) -> Stack | None:
     return np.asarray(frames)[None]
 
 
-def recognises(path: Path) -> bool:
+def _holds_arrays(path: Path) -> bool:
     """Whether a file of HDF5 or NumPy holds such arrays."""
+    if not path.is_file():
+        return False
     if h5py.is_hdf5(path):
         with open_hdf5(path) as file:
             return any(_holds_values(file.get(name)) for name in FRAMES)
@@ -106,15 +99,76 @@ def recognises(path: Path) -> bool:
         return any(f"{name}.npy" in archive.namelist() for name in FRAMES)
 
 
-def _recognises(path: Path) -> bool:
-    return path.is_file() and recognises(path)
-
-
 LOADER = Loader(
-    "arrays",
-    f"a NumPy archive (.npz) or an HDF5 file with the array {FRAMES[0]}",
-    _recognises,
-    reader(open_arrays),
-    RAW_TAKES,
-    open_arrays,
+    *("arrays", f"a NumPy archive (.npz) or an HDF5 file with the array {FRAMES[0]}", _holds_arrays),
+    *(reader(open_arrays), RAW_TAKES, open_arrays),
+)
+
+
+DATA, WHITE, BLACK, THETA = (f"exchange/{name}" for name in ("data", "data_white", "data_dark", "theta"))
+STACKS = ((PROJECTION, DATA), (FLAT, WHITE), (DARK, BLACK))
+INSTRUMENT = "measurement/instrument"
+ENERGIES = (f"{INSTRUMENT}/monochromator/energy",)
+DISTANCES = (f"{INSTRUMENT}/detector_motor_stack/setup/camera_distance", f"{INSTRUMENT}/detector/distance")
+PIXEL_SIZES = (
+    f"{INSTRUMENT}/detection_system/objective/resolution",
+    f"{INSTRUMENT}/detector/actual_pixel_size_x",
+    f"{INSTRUMENT}/detector/x_actual_pixel_size",
+)
+
+
+@contextmanager
+def open_exchange(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Iterator[ScanFile]:
+    """A data-exchange file, checked except for its frames.
+
+    given: values that go before the file's, by name (`TAKES`). Errors: `InputError` names the file, the dataset, and
+    the option that says what is missing.
+    """
+    with open_hdf5(path) as file:
+        fields = Fields(Path(path), file)
+        parts = [(kind, _frames(fields, name)) for kind, name in STACKS]
+        found = {
+            "energy_kev": _number(fields, ENERGIES, ENERGY_UNITS, "keV"),
+            "distance": _number(fields, DISTANCES, LENGTH_UNITS, "m"),
+            "pixel_size": _number(fields, PIXEL_SIZES, LENGTH_UNITS, "m"),
+            "angles_deg": _angles(fields),
+        }
+        yield ScanFile.of(Path(path), parts, given, found, fields.label(DATA), fields.label(WHITE))
+
+
+def _frames(fields: Fields, name: str) -> h5py.Dataset | None:
+    """The dataset `name` if it is there, and holds frames: some programs leave an empty one."""
+    found = fields.dataset(name) if fields.find(name) else None
+    return None if found is None or 0 in found.shape else found
+
+
+def _number(fields: Fields, names: tuple[str, ...], table: dict[str, float], unit: str) -> float | None:
+    """The first number above 0 of the datasets `names`, in the base unit of `table`; a length needs its unit."""
+    for name in names:
+        found = fields.group.get(name)
+        if not isinstance(found, h5py.Dataset) or found.size != 1 or (unit == "m" and "units" not in found.attrs):
+            continue
+        value = float(fields.numbers(name).reshape(-1)[0]) * fields.unit(name, table, unit)
+        if value > 0:
+            return value
+    return None
+
+
+def _angles(fields: Fields) -> np.ndarray | None:
+    """The angles [degrees]; without a unit they are degrees, as all programs of this format write them."""
+    if not fields.find(THETA):
+        return None
+    return np.rad2deg(fields.numbers(THETA).reshape(-1) * fields.unit(THETA, ANGLE_UNITS, "deg"))
+
+
+def _is_exchange(path: Path) -> bool:
+    """Whether a file is one of data exchange."""
+    if not (path.is_file() and h5py.is_hdf5(path)):
+        return False
+    with open_hdf5(path) as file:
+        return isinstance(file.get(DATA), h5py.Dataset)
+
+
+EXCHANGE = Loader(
+    *("data-exchange", f"an HDF5 file with /{DATA}", _is_exchange, reader(open_exchange), RAW_TAKES, open_exchange)
 )

@@ -8,7 +8,6 @@ curve that fills space (Morton 1966), so that neighbours in the file are neighbo
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import h5py
@@ -110,15 +109,9 @@ class Whole:
         return self.numbers.dtype.kind in "iu" and self.numbers.ndim > 0
 
 
-def encode(file: h5py.File, tensors: Mapping[str, Tensor], steps: Steps) -> None:
-    """A dataset for each tensor, last axis first, with the attributes `step` (0: values as they are), `differences`
-    along the rows where these take less, and `dtype`."""
-    for name, tensor in tensors.items():
-        put_whole(file, name, Whole.of(name, tensor, steps))
-
-
 def put_whole(group: h5py.Group, name: str, whole: Whole) -> h5py.Dataset:
-    """The dataset of one tensor."""
+    """The dataset of a tensor, last axis first, with the attributes `step` (0: values as they are), `differences` along
+    the rows where these take less, and `dtype`."""
     numbers, differences = whole.numbers, False
     if whole.counted:
         apart = np.diff(numbers, axis=-1, prepend=0)
@@ -127,11 +120,6 @@ def put_whole(group: h5py.Group, name: str, whole: Whole) -> h5py.Dataset:
     dataset = group.create_dataset(name, data=numbers, **(COMPRESSED if numbers.size and numbers.ndim else {}))
     dataset.attrs.update(step=whole.step, differences=differences, dtype=str(whole.dtype))
     return dataset
-
-
-def decode(dataset: h5py.Dataset, label: str) -> np.ndarray:
-    """The values of a dataset that `encode` made; `InputError` where its attributes say nothing sensible."""
-    return get_whole(dataset, label).values()
 
 
 def get_whole(dataset: h5py.Dataset, label: str) -> Whole:

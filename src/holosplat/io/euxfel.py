@@ -56,11 +56,13 @@ class KeyStack:
         return self._read(MASK, number) != 0 if self.is_marked else np.zeros(self.shape[1:], dtype=bool)
 
     def _read(self, name: str, number: int) -> np.ndarray:
+        from extra_data import by_id
+
         train, pulse = self.places[number]
         with as_written(self.path, RUN):
             key = _run(str(self.path))[self.source, name]
             single = len(key.entry_shape) == 2
-            frame = key.select_trains(_by_id()[[train]]).ndarray(roi=() if single else (slice(pulse, pulse + 1),))
+            frame = key.select_trains(by_id[[train]]).ndarray(roi=() if single else (slice(pulse, pulse + 1),))
             return frame.reshape(self.shape[1:])
 
 
@@ -252,17 +254,8 @@ def _run(path: str) -> Any:
         raise InputError(f"{path} must be {RUN}, but opening it failed: {error}.") from None
 
 
-def _by_id() -> Any:
-    from extra_data import by_id
-
-    return by_id
-
-
-def _recognises(path: Path) -> bool:
-    return path.is_dir() and any(FILES.match(file.name) for file in path.iterdir())
-
-
 LOADER = Loader(
-    *("euxfel", "a run of the European XFEL (RAW-R….h5)", _recognises, read_euxfel),
+    *("euxfel", "a run of the European XFEL (RAW-R….h5)"),
+    *(lambda path: path.is_dir() and any(FILES.match(file.name) for file in path.iterdir()), read_euxfel),
     *((*TAKES, "sources", "trains", "pulses", "frame_rate"), open_euxfel),
 )

@@ -16,11 +16,10 @@ import numpy as np
 
 from ..checks import InputError
 from ..geometry import Grid
+from .formats import FORMATS, HDF5_SUFFIXES, volume_format
 from .hdf5 import Fields, attribute_numbers, attribute_text, open_hdf5
 from .json import read_json
-from .ome_tiff import TIFF_SUFFIXES, ome_grid
-from .ome_zarr import ZARR_SUFFIX
-from .volume_formats import FORMATS, HDF5_SUFFIXES, volume_format
+from .ome import TIFF_SUFFIXES, ZARR_SUFFIX, ome_grid
 from .volumes import ABSORPTION, MU, REFRACTION, Contents
 from .vtk import SUFFIXES as MESHES
 from .vtk import mesh_files, read_meshes
@@ -59,7 +58,8 @@ def facts_of_matter(path: Path) -> Facts | None:
     if path.suffix.lower() in MESHES or (path.is_dir() and any(one.suffix.lower() in MESHES for one in path.iterdir())):
         return _of_mesh(path)
     if path.suffix.lower() in TIFF_SUFFIXES:
-        return _of_ome(path)
+        found = ome_grid(path)
+        return None if found is None else Facts(_of_grid("OME-TIFF", *found))
     if path.suffix.lower() in FORMATS and path.suffix.lower() not in HDF5_SUFFIXES:
         return _of_read(path)
     if not (path.is_file() and h5py.is_hdf5(path)):
@@ -148,11 +148,6 @@ def _of_mesh(path: Path) -> Facts:
     )
     command = f"holosplat simulate {path} --length-unit um --material NAME --detector ROWS COLUMNS --out scan.nxs"
     return Facts(rows, missing, (command,))
-
-
-def _of_ome(path: Path) -> Facts | None:
-    found = ome_grid(path)
-    return None if found is None else Facts(_of_grid("OME-TIFF", *found))
 
 
 def _of_grid(form: str, grid: Grid, of: Contents) -> dict[str, str]:

@@ -1,34 +1,115 @@
-"""Scans of every format that the project knows: `read` recognises the format by the content of a path."""
+"""Every format that the project knows: of scans, by the content of a path, and of volumes, by the suffix of a file.
+
+A run folder is one of them: its scan is that which `source.json` names, read as the run read it. Volumes of shares that
+others wrote, as TIFF images, say what their numbers are by `StackMeaning`.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from ..checks import InputError, require
+import numpy as np
+
+from ..checks import InputError, finite, in_range, require
 from ..frames import Frames
+from ..geometry import Grid
+from ..matter import DeltaBeta
+from ..progress import Advance
+from ..ranges import Small, ranged
 from ..scan import Scan
-from . import arrays, euxfel, exchange, images, nerf_synthetic, nxtomo, r2_gaussian, run_scan, tiff
-from .raw_file import Loader, ScanFile
+from ..volume import Object, Volume
+from . import arrays, euxfel, images, nerf_synthetic, nxtomo, r2_gaussian
+from .file_order import in_order
+from .hdf5 import open_hdf5
+from .hdf5_guard import is_vouched
+from .ome import TIFF_SUFFIXES, ZARR_SUFFIX, read_ome_tiff, read_ome_zarr, require_zarr, write_ome_tiff, write_ome_zarr
+from .plain_values import both, read_mrc, read_nrrd, write_mrc, write_nrrd
+from .raw_file import Loader, ScanFile, folder_with
 from .reading import Reading
+from .stacks import all_images
 from .stored_frames import Mended, with_fields
+from .table import Table
+from .volumes import REFRACTION, VOXEL_RANGE_M, Contents, Stored, read_stored, write_voxels
+from .vti import read_vti, write_vti
+
+SOURCE, SUMMARY = "source.json", "summary.json"
+
+
+def run_reading(path: str | Path) -> Reading:
+    """How the run folder `path` read its scan; `InputError` for a source.json that is damaged.
+
+    Whether the scan may bring values of other files, the folder does not decide: it is as whoever reads it allows
+    (`Told.vouch`).
+    """
+    table = Table.read(Path(path) / SOURCE)
+    time_frame = table.values.get("time_frame")
+    known = time_frame is None or time_frame in ("all", "still") or isinstance(time_frame, int)
+    require(known, f"{table.label('time_frame')} must be a number, 'all' or null, but it is {time_frame!r}.")
+    said = Reading.from_table(table.values.get("reading", {}), f"{table.label('reading')}")
+    told = replace(said.told, allow_external=is_vouched(Path(path)))
+    return Reading(told, replace(said.part, time_frame=time_frame))
+
+
+def run_source(scan: Path, reading: Reading) -> dict[str, object]:
+    """What source.json says of a run of `scan`, read in a certain way."""
+    return {"scan": str(scan.resolve()), "time_frame": reading.part.time_frame, "reading": reading.as_table()}
+
+
+def read_run_scan(path: str | Path) -> Scan:
+    """The scan of the run folder `path`, read as the run read it: its frames of the time that the run is of, too.
+
+    Where the run refined the geometry, its frames are where it found them. Errors: `InputError` when the scan is no
+    longer there or cannot be read.
+    """
+    table = Table.read(Path(path) / SOURCE)
+    scan = Path(table.text("scan"))
+    there = scan.exists() and scan.resolve() != Path(path).resolve()
+    require(there, f"{table.label('scan')} must name the run's scan, but {scan} is not there or none; name another.")
+    return _where_found(Path(path) / SUMMARY, read_as(scan, run_reading(path)))
+
+
+def _where_found(summary: Path, scan: Scan) -> Scan:
+    """`scan` with the exposures that `summary` has, if the run found any; errors: `InputError` for other frames."""
+    found = Table.read(summary).values.get("geometry") if summary.is_file() else None
+    if found is None:
+        return scan
+    table, n = Table(summary, found, "geometry."), len(scan)
+    rotations, shifts = table.numbers("rotations", (n, 3, 3)), table.numbers("shifts", (n, 2))
+    planned = scan.exposures
+    old = "pixel_sizes" not in found
+    sizes = planned.views.pixel_sizes if old else table.numbers("pixel_sizes", (n,))
+    views = replace(planned.views, rotations=rotations, shifts=shifts, scales=sizes / planned.views.pitch)
+    exposures = replace(planned, views=views, distance=table.numbers("distance", (n,)))
+    return scan.taken(exposures)
+
+
+def read_marks(path: Path, names: Sequence[str]) -> dict[str, str]:
+    """Those of the attributes `names` that the file has at its top. Errors: `InputError`."""
+    with open_hdf5(path) as file:
+        return {name: str(file.attrs[name]) for name in names if name in file.attrs}
+
 
 ScanFormat = Literal["nxtomo", "nerf-synthetic", "tiff", "r2-gaussian"]
 """Formats that scans are written in."""
 
 LOADERS: tuple[Loader, ...] = (
     nxtomo.LOADER,
-    exchange.LOADER,
+    arrays.EXCHANGE,
     arrays.LOADER,
-    tiff.LOADER,
+    images.TIFF,
     images.LOADER,
     euxfel.LOADER,
     nerf_synthetic.LOADER,
     r2_gaussian.LOADER,
-    run_scan.loader(lambda path, reading: read_as(path, reading)),
+    Loader(
+        *("run", f"a run folder, with config.json and {SOURCE}", folder_with("config.json", SOURCE)),
+        lambda path, given: read_run_scan(path),
+    ),
 )
 """Every format that scans are read from; a new one is a file and a line here (docs/adding.md)."""
 
@@ -108,6 +189,7 @@ def loader_of(path: str | Path) -> Loader:
     found = Path(path)
     require(found.exists(), f"{path} must be a scan, but there is no such file or folder; check the path.")
     loaders = [loader for loader in LOADERS if loader.recognises(found)]
+    loaders = [loader for loader in loaders if not loader.is_general] or loaders
     if len(loaders) == 1:
         return loaders[0]
     if loaders:
@@ -125,3 +207,120 @@ def _content(path: Path) -> str:
     if not endings:
         return "is an empty folder"
     return f"holds {', '.join(f'{count} of {name}' for name, count in endings.most_common(3))}"
+
+
+HDF5_SUFFIXES = (".h5", ".hdf5")
+
+
+@dataclass(frozen=True)
+class VolumeFormat:
+    """A format of volumes of δ and β. write: an object on a grid; files: all that it makes; needs: a package, which it
+    asks for."""
+
+    write: Callable[[Path, Object, Grid, Advance, Contents], None]
+    read: Callable[[Path], Stored]
+    files: Callable[[Path], tuple[Path, ...]] = lambda path: (path,)
+    needs: Callable[[], Any] = lambda: None
+
+
+def _write_tiff(path: Path, obj: Object, grid: Grid, on_progress: Advance, of: Contents) -> None:
+    write_ome_tiff(path, obj.voxelise(grid), of)
+    on_progress(1.0)
+
+
+FORMATS = {
+    **dict.fromkeys(HDF5_SUFFIXES, VolumeFormat(write_voxels, read_stored)),
+    **dict.fromkeys(TIFF_SUFFIXES, VolumeFormat(_write_tiff, read_ome_tiff)),
+    ZARR_SUFFIX: VolumeFormat(write_ome_zarr, read_ome_zarr, needs=require_zarr),
+    ".vti": VolumeFormat(write_vti, read_vti),
+    ".nrrd": VolumeFormat(write_nrrd, read_nrrd, both),
+    ".mrc": VolumeFormat(write_mrc, read_mrc, both),
+}
+
+
+def volume_format(path: Path, called: str = "a volume") -> VolumeFormat:
+    """The format that the suffix of `path` names; `InputError` for any other, and where its package is missing.
+
+    called: what the message calls the path.
+    """
+    found = FORMATS.get(path.suffix.lower())
+    require(
+        found is not None,
+        f"{called} must be a file whose name ends with {', '.join(FORMATS)}, by which its format is chosen, but it is "
+        f"{path}; name another one.",
+    )
+    assert found is not None
+    found.needs()
+    return found
+
+
+def write_volume_file(
+    path: Path, obj: Object, grid: Grid, on_progress: Advance = lambda fraction: None, of: Contents = REFRACTION
+) -> None:
+    """Write δ and β (or what arrays are `of`) of `obj` on `grid` in the format that the suffix of `path` names."""
+    volume_format(path).write(path, obj, grid, on_progress, of)
+
+
+def of_time(path: Path, frame: int) -> Path:
+    """The path with the number of a time, _t0000 say, before its suffixes, of which .ome.zarr and .ome.tif are two."""
+    stem, ome, _ = path.stem.partition(".ome")
+    return path.with_name(f"{stem}_t{frame:04d}{ome}{path.suffix}")
+
+
+def read_volume_file(path: Path) -> Volume:
+    """δ and β of a volume file of any format, by its suffix."""
+    return volume_format(path).read(path).volume(path)
+
+
+@dataclass(frozen=True)
+@ranged
+class StackMeaning:
+    """What a stack of TIFF images shows.
+
+    voxel_size: edge of its cubic voxels [m]; of: δ and β of a value of one.
+    stacked: the axis along which pages follow each other: y for slices across the rotation axis (rows of a page along
+    z), z for slices along it (rows of a page along y).
+    """
+
+    voxel_size: Small
+    of: DeltaBeta
+    stacked: Literal["y", "z"] = "y"
+
+    def __post_init__(self) -> None:
+        in_range("voxel_size", self.voxel_size, *VOXEL_RANGE_M, unit="metres")
+        require(self.stacked in ("y", "z"), f"stacked must be y or z, but it is {self.stacked!r}.")
+
+
+def read_specimen(paths: Sequence[Path], meaning: StackMeaning | None) -> Volume:
+    """The volume of one file that says what it is (`read_volume_file`); or of TIFF files, one of many pages, or many in
+    the order of their names, about the origin.
+
+    meaning: of TIFF files that do not say it themselves. Errors: `InputError` for other files, for several without a
+    meaning, for formats that say it with one, and for images of different sizes.
+    """
+    if meaning is None:
+        require(
+            len(paths) == 1, f"a volume must be one file, but there are {len(paths)}; for images, give --voxel-size."
+        )
+        return read_volume_file(paths[0])
+    for path in paths:
+        require(
+            path.suffix.lower() in TIFF_SUFFIXES,
+            f"--voxel-size and the like are of TIFF images, but {path} is none; leave them out where files say it.",
+        )
+    values = np.concatenate([_pages(path) for path in in_order(paths)])
+    if meaning.stacked == "y":
+        values = values.transpose(1, 0, 2)
+    values = values.astype(np.float64)
+    grid = Grid.centred((values.shape[0], values.shape[1], values.shape[2]), meaning.voxel_size)
+    return Volume(meaning.of.delta * values, meaning.of.beta * values, grid)
+
+
+def _pages(path: Path) -> np.ndarray:
+    """The pages [P, rows, columns] of a TIFF file."""
+    require(path.is_file(), f"{path} must be a TIFF file, but there is none; correct the path.")
+    pages = all_images(path)
+    shapes = sorted({page.shape for page in pages})
+    grey = len(shapes) == 1 and len(shapes[0]) == 2 and all(page.dtype.kind in "iuf" for page in pages)
+    require(grey, f"{path} must hold grey images of one size, but it holds {', '.join(map(str, shapes)) or 'none'}.")
+    return finite(f"{path}", np.stack(pages))

@@ -2,6 +2,8 @@
 
 In a folder, files named flat… and dark… (or in folders of such names) correct the others, which may be in a folder of
 their own, such as projections. A text file named …angles… beside them holds their angles. Capitals do not matter.
+
+Scans from and to TIFF files (float32) beside a `scan.json` of how each frame was taken (docs/converting.md).
 """
 
 from __future__ import annotations
@@ -10,22 +12,22 @@ import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
-from ..checks import InputError, note, require
-from ..scan import Exposures
+from ..checks import InputError, finite, note, require
+from ..scan import Scan
 from .angles import angles_of, read_angles, tell_angles
+from .atomic import atomic_folder
 from .file_order import in_order
+from .json import write_json
 from .leftovers import is_hidden
 from .light_frames import light_frames
-from .nerf_synthetic import LOADER as NERF
-from .r2_gaussian import LOADER as R2
-from .raw_file import DARK, FLAT, NOTHING, PROJECTION, RAW_TAKES, Loader, ScanFile, exposures_of, together
-from .stacks import IMAGES, ImageStack, images_in, stack_of
+from .raw_file import DARK, FLAT, NOTHING, PROJECTION, RAW_TAKES, Loader, ScanFile
+from .stacks import IMAGES, ImageStack, all_images, images_in, stack_of
 from .stored_frames import reader
-from .tiff import LOADER as TIFF
+from .table import Table, beam_table, exposure_table, read_exposures
 
 FIELDS = {FLAT: "flat|white|open_?beam|bright|refs?(?![a-z])|refhst", DARK: "dark"}
 """How the names of flats and of darks, and of their folders, begin, or a word in them."""
@@ -53,13 +55,10 @@ def open_images(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Iterato
     """
     source = Path(path)
     parts = [(PROJECTION, stack_of(source))] if source.is_file() else _in_folder(source, given.get("files"))
-    stacks, kinds = together(str(path), [*parts, *_greys(source, parts, given)])
-    projections = kinds == PROJECTION
     found = {} if source.is_file() or given.get("angles_deg") is not None else _angles(source)
-    exposures = exposures_of(str(path), given, found, stacks[0].shape[1:], projections)  # type: ignore[arg-type]
-    _tell_order(source, stacks, kinds, exposures)
-    nothing_held_out = np.zeros(int(projections.sum()), dtype=bool)
-    yield ScanFile(source, str(path), stacks, kinds, exposures, nothing_held_out, kinds_label=str(path))
+    file = ScanFile.of(source, [*parts, *_greys(source, parts, given)], given, found)
+    _tell_order(file)
+    yield file
 
 
 def _greys(path: Path, parts: list[tuple[int, Any]], given: Mapping[str, Any]) -> list[tuple[int, Any]]:
@@ -192,19 +191,17 @@ def _angles(folder: Path) -> dict[str, Any]:
     return {"angles_deg": angles}
 
 
-def _tell_order(source: Path, stacks: tuple[Any, ...], kinds: np.ndarray, exposures: Exposures) -> None:
+def _tell_order(found: ScanFile) -> None:
     """Say which files are the first and the last projection, with their angles, and count the flats and darks."""
-    first, angles = stacks[0], angles_of(exposures.views)
+    first, angles = found.stacks[0], angles_of(found.exposures.views)
     if not isinstance(first, ImageStack) or angles is None or len(angles) < 2:
         return
     ends = ", ".join(f"{which} {first.name(n)} at {angles[n]:.6g}°" for which, n in (("first", 0), ("last", -1)))
-    counts = [f", {count} {name}" for kind, name in KINDS.items() if (count := int((kinds == kind).sum()))]
-    note(f"{source}: {len(angles)} projections ({ends}){''.join(counts)}")
+    counts = [f", {count} {name}" for kind, name in KINDS.items() if (count := len(found.numbers(kind)))]
+    note(f"{found.path}: {len(angles)} projections ({ends}){''.join(counts)}")
 
 
 def _recognises(path: Path) -> bool:
-    if any(loader.recognises(path) for loader in (TIFF, NERF, R2)):
-        return False
     if path.is_file():
         return path.suffix.lower() in (*IMAGES, ".npy")
     folders = any(PROJECTIONS.match(one.name) or _kind(one) for one in _folders(path))
@@ -212,11 +209,74 @@ def _recognises(path: Path) -> bool:
 
 
 LOADER = Loader(
-    *(
-        "images",
-        f"images ({', '.join(IMAGES)}), one file or a folder of them, or an array (.npy)",
-        _recognises,
-        reader(open_images),
-    ),
-    *((*RAW_TAKES, "files", "black", "white"), open_images),
+    *("images", f"images ({', '.join(IMAGES)}), one file or a folder of them, or an array (.npy)", _recognises),
+    *(reader(open_images), (*RAW_TAKES, "files", "black", "white"), open_images, True),
 )
+
+
+FORMAT = "holosplat TIFF 1"
+SCAN = "scan.json"
+STACK = "frames.tif"
+
+TiffLayout = Literal["stack", "files"]
+
+
+def write_tiff(path: str | Path, scan: Scan, layout: TiffLayout = "stack") -> None:
+    """Write `scan` as a folder: all frames as pages of frames.tif, or one file a frame, and scan.json."""
+    import tifffile
+
+    entries = [{**exposure_table(scan.exposures, n), "test": bool(scan.is_test[n])} for n in range(len(scan))]
+    with atomic_folder(path) as folder:
+        if layout == "stack":
+            tifffile.imwrite(folder / STACK, scan.frames, photometric="minisblack", metadata=None)
+        else:
+            for n, (frame, entry) in enumerate(zip(scan.frames, entries)):
+                entry["file"] = f"frame_{n:04d}.tif"
+                tifffile.imwrite(folder / entry["file"], frame, photometric="minisblack", metadata=None)
+        pages = {"file": STACK} if layout == "stack" else {}
+        write_json(folder / SCAN, {"format": FORMAT, **beam_table(scan), **pages, "frames": entries})
+
+
+def read_tiff(path: str | Path) -> Scan:
+    """The scan of a folder with scan.json and the TIFF files that it names: one of many pages, or one a frame."""
+    table = Table.read(Path(path) / SCAN)
+    table.require_format(FORMAT)
+    entries = table.tables("frames")
+    require(len(entries) > 0, f"{table.label('frames')} must hold at least one frame, but it holds none.")
+    if "file" in table:
+        frames = _pages(table.file("file"), len(entries))
+    else:
+        frames = [_pages(entry.file("file"), 1)[0] for entry in entries]
+    h, w = frames[0].shape
+    for entry, frame in zip(entries, frames):
+        where = entry.where.rstrip(".")
+        require(
+            frame.shape == (h, w),
+            f"{table.path}: the image of {where} must have {(h, w)} pixels as the first, but it has {frame.shape}.",
+        )
+        finite(f"{table.path}: the image of {where}", frame)
+    is_test = np.array(["test" in entry and entry.flag("test") for entry in entries])
+    return Scan(np.stack(frames), read_exposures(table, entries, (h, w)), is_test, table.texts("provenance"))
+
+
+def _pages(file: Path, count: int) -> list[np.ndarray]:
+    """The `count` pages of a TIFF file, each [H, W]."""
+    pages = all_images(file)
+    require(len(pages) == count, f"{file} must hold {count} pages, one a frame, but it holds {len(pages)}.")
+    for page in pages:
+        grey = page.ndim == 2 and page.dtype.kind in "iuf"
+        require(grey, f"{file} must hold grey images of numbers, but one is {page.dtype} of the shape {page.shape}.")
+    return pages
+
+
+def _is_own(path: Path) -> bool:
+    """The folder, or in it scan.json or an image."""
+    named = path.name == SCAN or path.suffix.lower() in (".tif", ".tiff")
+    return (_folder(path) / SCAN).is_file() and (path.is_dir() or named)
+
+
+def _folder(path: Path) -> Path:
+    return path if path.is_dir() else path.parent
+
+
+TIFF = Loader("tiff", f"a folder with {SCAN}, or an image in it", _is_own, lambda path, given: read_tiff(_folder(path)))

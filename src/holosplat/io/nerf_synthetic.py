@@ -10,20 +10,54 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from PIL import Image
 
 from ..checks import InputError, UnsaidError, at_least, in_range, require
 from ..geometry import Views
 from ..ranges import Metres, Positive, Signed, Small, ranged
 from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, Scan, checked_distance
 from .atomic import atomic_folder
+from .guard import undamaged
 from .json import write_json
-from .png import LEVELS, PngKind, read_png, write_png
 from .raw_file import Loader, folder_with, require_said, stand_in
 from .seeds import hull_points, uniform_points
 from .table import Table, beam_table, exposure_table, in_order, read_exposures
+
+PngKind = Literal["grey16", "rgba8"]
+LEVELS: dict[PngKind, int] = {"grey16": 65535, "rgba8": 255}
+"""The white of each kind."""
+
+
+def write_png(path: Path, image: np.ndarray, kind: PngKind) -> None:
+    """Write `image` [H, W], black at 0 and white at 1, rounded to the levels of `kind` and cut off beyond them."""
+    levels = np.rint(np.clip(image, 0.0, 1.0) * LEVELS[kind])
+    if kind == "grey16":
+        Image.fromarray(levels.astype(np.uint16)).save(path, format="PNG")
+    else:
+        grey = Image.fromarray(levels.astype(np.uint8))
+        Image.merge("RGBA", (grey, grey, grey, Image.new("L", grey.size, 255))).save(path, format="PNG")
+
+
+def read_png(path: Path) -> tuple[np.ndarray, int]:
+    """An image's levels [H, W] as they stand in the file, and its white: 255 or 65535.
+
+    Colours must be equal and alpha opaque; `InputError` otherwise, or if the file is damaged.
+    """
+    with undamaged(path, "a complete PNG image"), Image.open(path, formats=("PNG",)) as image:
+        mode, values = image.mode, np.asarray(image)
+    if mode.startswith("I"):  # 16 bits: "I;16", and "I" in older versions of Pillow
+        return values, LEVELS["grey16"]
+    require(mode in ("L", "LA", "RGB", "RGBA"), f"{path} must be a grey image of 8 or 16 bits, but its kind is {mode}.")
+    bands = values if values.ndim == 3 else values[..., None]
+    if mode.endswith("A"):
+        require(bool((bands[..., -1] == 255).all()), f"{path} must be opaque, but its alpha is not; fill it in first.")
+        bands = bands[..., :-1]
+    require(bool((bands == bands[..., :1]).all()), f"{path} must be grey, but it has colours; make it grey first.")
+    return bands[..., 0], LEVELS["rgba8"]
+
 
 FORMAT = "holosplat NeRF-synthetic 1"
 TRAIN, TEST, VAL = (f"transforms_{split}.json" for split in ("train", "test", "val"))
@@ -110,7 +144,7 @@ def write_nerf_synthetic(
     a copy of the test's: most readers ask for one. Errors: `InputError` for views of several pixel sizes, since one
     angle of view serves all cameras.
     """
-    from .splats import write_ply  # needs torch, which takes longer than all else
+    from .solids import write_ply  # needs torch, which takes longer than all else
 
     _ = scan.views.pixel_size
     views, train = scan.views, np.flatnonzero(~scan.is_test)

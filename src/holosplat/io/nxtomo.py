@@ -16,7 +16,6 @@ from ..checks import finite, require, shaped
 from ..divided_light import DividedLight
 from ..scan import Exposures, Scan
 from ..version import __version__
-from . import arrays, exchange
 from .hdf5_writing import new_hdf5, put, room_for
 from .light import LIGHT, write_divided_light
 from .raw_file import NOTHING, PROJECTION, RAW_TAKES, Loader
@@ -211,8 +210,7 @@ def _escaped(key: str) -> str:
     return escaped.replace(".", "%2E") if set(escaped) == {"."} else escaped
 
 
-def _recognises(path: Path) -> bool:
-    return path.is_file() and h5py.is_hdf5(path) and not (exchange.recognises(path) or arrays.recognises(path))
-
-
-LOADER = Loader("nxtomo", "an HDF5 file", _recognises, read_scan, (*RAW_TAKES, "entry"), open_scan)
+LOADER = Loader(
+    *("nxtomo", "an HDF5 file", lambda path: path.is_file() and h5py.is_hdf5(path)),
+    *(read_scan, (*RAW_TAKES, "entry"), open_scan, True),
+)

@@ -8,7 +8,6 @@ them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -270,8 +269,7 @@ def _absorber(
 TAKES = ("energy_kev", "pixel_size")
 
 
-def _read(path: Path, given: Mapping[str, float]) -> Scan:
-    return read_r2_gaussian(path, *(given.get(name) for name in TAKES))
-
-
-LOADER = Loader("r2-gaussian", f"a folder with {META}", folder_with(META), _read, TAKES)
+LOADER = Loader(
+    *("r2-gaussian", f"a folder with {META}", folder_with(META)),
+    *(lambda path, given: read_r2_gaussian(path, *(given.get(name) for name in TAKES)), TAKES),
+)

@@ -93,6 +93,24 @@ class ScanFile:
     has_given_fields: bool = False
     divided: DividedLight | None = None
 
+    @classmethod
+    def of(
+        cls,
+        path: Path,
+        parts: Sequence[tuple[int, Stack | None]],
+        given: Mapping[str, Any],
+        found: Mapping[str, Any],
+        label: str = "",
+        kinds_label: str = "",
+    ) -> ScanFile:
+        """That of `parts`, stacks of one kind each (`together`), whose exposures are `given`, or else `found` in it
+        (`exposures_of`); nothing is held out. label, kinds_label: its path where they are left out."""
+        stacks, kinds = together(str(path), parts)
+        projections, shape = kinds == PROJECTION, stacks[0].shape
+        exposures = exposures_of(str(path), given, found, (shape[1], shape[2]), projections)
+        held_out = np.zeros(len(exposures), dtype=bool)
+        return cls(path, label or str(path), stacks, kinds, exposures, held_out, kinds_label=kinds_label or str(path))
+
     def numbers(self, kind: int) -> np.ndarray:
         """Which of the N frames are of `kind`."""
         return np.flatnonzero(self.kinds == kind)
@@ -241,6 +259,7 @@ class Loader:
     takes: names of these values (energy_kev [keV], distance [m], pixel_size [m], angles_deg [N], flats and darks,
         paths of images; files, the names of images in a folder; entry, of an HDF5 file; black, white).
     opens: opens such a file frame by frame, raw ones with their flats and darks; None where frames are corrected.
+    is_general: whether it takes what none of the others recognises.
     """
 
     name: str
@@ -249,6 +268,7 @@ class Loader:
     read: Callable[[Path, Mapping[str, Any]], Scan]
     takes: tuple[str, ...] = ()
     opens: Opens | None = None
+    is_general: bool = False
 
 
 def folder_with(*names: str) -> Callable[[Path], bool]:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..checks import InputError, MissingError, note, require, require_regular
-from .guard import RATIO, SMALL, mapped_array, require_declared, require_inflated, require_memory
+from .guard import RATIO, SMALL, mapped_array, require_declared, require_inflated, require_memory, undamaged
 from .leftovers import is_hidden
 
 IMAGES = (".tif", ".tiff", ".png")
@@ -61,7 +61,8 @@ def stack_of(path: Path, pattern: str | None = None) -> ImageStack | np.ndarray:
     if path.suffix.lower() == ".npy" and path.is_file():
         return _array(path)
     files = images_in(path, pattern) if path.is_dir() else [path]
-    require(len(files) > 0, f"{path} must hold images ({', '.join(IMAGES)}), but it holds none{_like(pattern)}.")
+    like = f" named {pattern}" if pattern else ""
+    require(len(files) > 0, f"{path} must hold images ({', '.join(IMAGES)}), but it holds none{like}.")
     require(files[0].is_file(), f"{path} must be images or a folder of them, but there is nothing; check the path.")
     require(
         _is_image(files[0]),
@@ -77,10 +78,6 @@ def images_in(folder: Path, pattern: str | None = None) -> list[Path]:
 
 def _is_image(file: Path) -> bool:
     return file.suffix.lower() in IMAGES and file.is_file() and not is_hidden(file)
-
-
-def _like(pattern: str | None) -> str:
-    return f" named {pattern}" if pattern else ""
 
 
 def _array(path: Path) -> np.ndarray:
@@ -103,12 +100,12 @@ def _pages(file: Path) -> list[int]:
 
 def _image(file: Path, page: int) -> np.ndarray:
     """One grey image [H, W]; of a coloured one whose colours are equal, one of them."""
-    try:
-        image = _png(file) if file.suffix.lower() == ".png" else _tiff(file, page)
-    except InputError:
-        raise
-    except Exception as error:  # tifffile and Pillow raise many kinds for damaged files
-        raise InputError(f"{file} must be a complete image, but it is damaged or none: {error}.") from None
+    with undamaged(file, "a complete image"):
+        if file.suffix.lower() == ".png":
+            image = _png(file)
+        else:
+            with open_tiff(file) as opened:
+                image = image_values(opened, file, page)
     if image.ndim == 3 and image.shape[2] in (3, 4) and (image[..., :3] == image[..., :1]).all():
         image = image[..., 0]
     grey = image.ndim == 2 and image.dtype.kind in "iuf"
@@ -121,11 +118,6 @@ def _png(file: Path) -> np.ndarray:
 
     with Image.open(file, formats=("PNG",)) as opened:
         return np.asarray(opened.convert("RGB") if opened.mode == "P" else opened)
-
-
-def _tiff(file: Path, page: int) -> np.ndarray:
-    with open_tiff(file) as opened:
-        return image_values(opened, file, page)
 
 
 DEFLATE = (8, 32946)

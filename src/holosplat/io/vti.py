@@ -27,12 +27,11 @@ from ..progress import Advance
 from ..units import LENGTH_UNITS, unit_factor
 from ..volume import Object
 from .atomic import atomic_path
-from .guard import require_declared, require_memory, xml_fault
+from .guard import blocks_fault, require_declared, require_memory, xml_fault
 from .hdf5_writing import require_room
 from .plain_values import LENGTH_UNIT, fill, micrometres
 from .volumes import NAMES, REFRACTION, Contents, Stored, contents_of, grid_of
-from .vtk import BODY, TRIANGLE, quiet, save
-from .vtk_guard import blocks_fault
+from .vtk import BODY, TRIANGLE, numbers_of, quiet, save
 
 UNIT = "length_unit"
 """The field array that says the unit of lengths."""
@@ -109,7 +108,7 @@ def read_vti(path: Path) -> Stored:
     shape = image.GetDimensions()[::-1]
     low = np.array(image.GetOrigin()) + np.array(image.GetSpacing()) * np.array(image.GetExtent()[::2])
     grid = grid_of(path, shape, [factor * v for v in image.GetSpacing()], [factor * v for v in low])
-    first, beta = (_values(array).reshape(shape) for array in arrays)
+    first, beta = (numbers_of(array).reshape(shape) for array in arrays)
     return Stored((first, beta), grid, of)
 
 
@@ -139,12 +138,6 @@ def _is_none(array: Any, image: Any) -> bool:
 
 def _names(data: Any) -> str:
     return ", ".join(str(data.GetArrayName(k)) for k in range(data.GetNumberOfArrays())) or "none"
-
-
-def _values(array: Any) -> np.ndarray:
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-
-    return vtk_to_numpy(array)
 
 
 def write_vtu(path: Path, bodies: Sequence[TriangleMesh], matter: Matter, of: Contents = REFRACTION) -> None:

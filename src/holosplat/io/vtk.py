@@ -22,9 +22,8 @@ from ..checks import InputError, require, require_regular
 from ..mesh import TriangleMesh
 from ..units import LENGTH_UNITS, unit_factor
 from .atomic import atomic_path
-from .guard import xml_fault
+from .guard import blocks_fault, cells_fault, legacy_fault, ply_fault, xml_fault
 from .leftovers import is_hidden
-from .vtk_guard import blocks_fault, cells_fault, legacy_fault, ply_fault
 
 SUFFIXES = (".vtk", ".vtu", ".vtp")
 MERGE_TOLERANCE = 1e-6
@@ -146,7 +145,7 @@ def _bodies(data: Any, faces: np.ndarray) -> dict[str, np.ndarray]:
     numbers = data.GetCellData().GetArray(BODY)
     if numbers is None or numbers.GetNumberOfValues() != len(faces):
         return {}
-    of = _array(numbers)
+    of = numbers_of(numbers)
     return {f"{BODY}{number:03.0f}": faces[of == number] for number in np.unique(of)}
 
 
@@ -243,7 +242,7 @@ def _flat_cells(grid: Any) -> Any | None:
     """An unstructured grid's flat cells as vtkPolyData; None unless they are all strips, or none is."""
     from vtkmodules.vtkCommonDataModel import vtkPolyData
 
-    kinds = set(_array(grid.GetDistinctCellTypesArray()).tolist())
+    kinds = set(numbers_of(grid.GetDistinctCellTypesArray()).tolist())
     if not kinds <= set(FLAT_CELLS) or (STRIP in kinds and len(kinds) > 1):
         return None
     surface = vtkPolyData()
@@ -254,7 +253,7 @@ def _flat_cells(grid: Any) -> Any | None:
 
 def _checked_points(path: Path, surface: Any) -> np.ndarray:
     """The surface's points [P, 3] in the file's unit, all finite."""
-    points = _array(surface.GetPoints().GetData()).astype(np.float64)
+    points = numbers_of(surface.GetPoints().GetData()).astype(np.float64)
     bad = int((~np.isfinite(points)).any(axis=1).sum())
     require(bad == 0, f"{path}: point coordinates must be finite, but {bad} of {len(points)} points are not.")
     return points
@@ -270,10 +269,11 @@ def _triangles(surface: Any) -> np.ndarray:
     cut.SetInputData(surface)
     cut.Update()
     polygons = cut.GetOutput().GetPolys()
-    return _array(polygons.GetConnectivityArray()).reshape(-1, 3).astype(np.int64)
+    return numbers_of(polygons.GetConnectivityArray()).reshape(-1, 3).astype(np.int64)
 
 
-def _array(vtk_array: Any) -> np.ndarray:
+def numbers_of(vtk_array: Any) -> np.ndarray:
+    """The values of an array of VTK."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     return vtk_to_numpy(vtk_array)

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..io.ome_tiff import TIFF_SUFFIXES
-from ..io.ome_zarr import CHUNK, ZARR_SUFFIX
+from ..io.ome import CHUNK, TIFF_SUFFIXES, ZARR_SUFFIX
 from ..io.volumes import SLAB_VOXELS
 from .needs import KEPT, Costs, Needs, Sizes, of_fit, of_start, with_report
 

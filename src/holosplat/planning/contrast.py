@@ -9,20 +9,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 
 from ..checks import finite, in_range, require
 from ..geometry import Views
-from ..materials import ENERGY_RANGE_KEV, DeltaBeta, Material
+from ..matter import DeltaBeta
 from ..mesh import TriangleMesh
-from ..model import Instrument
-from ..ranges import Metres, Pixels, ranged
-from ..scan import PIXEL_RANGE_M, Exposures, checked_distance
-from ..specimens.scene import MeshScene
+from ..ranges import Metres, Pixels, Positive, Small, ranged
+from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, checked_distance
 from ..units import wavelength, wavenumber
-from ..volume import LineIntegrals
+
+if TYPE_CHECKING:
+    from ..materials import Material
 
 FINE, COARSE = (8, 32), (4, 16)
 """Samples on the first fringe's width √(λz), and across the object. SNR² of a red cell is then right to 1 % or 2 %;
@@ -86,11 +86,11 @@ class Subject:
 class Setup:
     """The beam and the detector of one frame."""
 
-    energy_kev: float = 20.0
+    energy_kev: Positive = 20.0
     """Photon energy [keV]."""
     distance: Metres = 0.1
     """Effective propagation distance, in the sample plane [m]; 0: in contact."""
-    pixel_size: float = 3.2e-6
+    pixel_size: Small = 3.2e-6
     """Effective pixel size, in the sample plane [m]."""
     psf_sigma_px: Pixels = 0.0
     """Standard deviation of the detector's Gaussian point-spread function [pixels]."""
@@ -225,6 +225,12 @@ def _raster_of(subject: Subject, setup: Setup, samples: tuple[int, int]) -> _Ras
 
 def _frame(subject: Subject, setup: Setup, added: DeltaBeta, raster: _Raster) -> tuple[np.ndarray, np.ndarray]:
     """The object's thickness [m] and the intensity behind it at the raster's samples, both [count, count]."""
+    import torch  # which takes long to load, and the options of a plan do without
+
+    from ..model import Instrument
+    from ..specimens.scene import MeshScene
+    from ..volume import LineIntegrals
+
     shift = 0.5 * raster.pitch if raster.factor % 2 == 0 else 0.0  # a sample lies on each pixel's centre
     shape = (raster.count, raster.count)
     views = Views(np.eye(3)[None], np.full((1, 2), shift), shape, raster.pitch)

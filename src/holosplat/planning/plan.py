@@ -10,9 +10,8 @@ import numpy as np
 
 from ..checks import in_range, positive, require
 from ..geometry import Grid, Views
-from ..optics.noise import PHOTON_RANGE
 from ..progress import Advance
-from ..ranges import Frequency, Photons, Seconds, ranged
+from ..ranges import Frequency, Natural, Photons, Seconds, ranged
 from .contrast import Setup, Subject, Visibility, visibility
 
 WANTED_SNR = 5.0
@@ -30,9 +29,9 @@ class Recording:
 
     photons_per_pixel: Photons = 1000.0
     """Mean photons detected in a pixel without the object."""
-    views: int = 16
+    views: Natural = 16
     """Number of directions over 180°, recorded at the same instant."""
-    detector: tuple[int, int] | None = None
+    detector: tuple[Natural, Natural] | None = None
     """(rows, columns) of a frame [pixels] (default: not given, so no field and no data rate)."""
     frame_rate: Frequency | None = None
     """Frames a second [Hz] (default: no rates are computed)."""
@@ -40,12 +39,14 @@ class Recording:
     """Time with light in one frame, such as a pulse's length [s] (default: the whole frame)."""
     velocity: float | None = None
     """Velocity of the object across the beam [m/s] (default: no motion is considered)."""
-    bit_depth: int = 16
+    bit_depth: Natural = 16
     """Bits stored for a pixel."""
-    frames: int = 1
+    frames: Natural = 1
     """Number of recorded instants."""
 
     def __post_init__(self) -> None:
+        from ..optics.noise import PHOTON_RANGE  # with torch, which takes long to load
+
         in_range("photons_per_pixel", self.photons_per_pixel, *PHOTON_RANGE)
         for name, most in (("views", 10**6), ("frames", 10**9), ("bit_depth", 64)):
             value = getattr(self, name)
@@ -346,6 +347,8 @@ def survey(
     The photons a pixel are the same everywhere, and so are pixel and point-spread function (of `setup`);
     `on_progress(fraction)` is called after each point.
     """
+    from ..optics.noise import PHOTON_RANGE
+
     in_range("photons_per_pixel", photons_per_pixel, *PHOTON_RANGE)
     distances, energies = (np.asarray(a, dtype=np.float64).reshape(-1) for a in (distances, energies_kev))
     points = [replace(setup, energy_kev=float(e), distance=float(z)) for e in energies for z in distances]

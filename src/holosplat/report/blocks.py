@@ -16,11 +16,9 @@ from .content import UNSURE, GuessShown, ReportContent
 from .curves import correlation_figure, histogram_figure, history_figure
 from .figures import (
     evenly_chosen,
-    grey_limits,
     held_out_figure,
     plane_sizes,
     projections_figure,
-    residual_limit,
     richest_planes,
     scene_figure,
     slice_row,
@@ -41,7 +39,9 @@ from .style import (
     colour_bar,
     drawn_block,
     format_length,
+    grey_limits,
     in_print,
+    largest,
     letter,
     new_figure,
     scientific,
@@ -138,14 +138,14 @@ def _held_out(content: ReportContent) -> Block:
     figure = held_out_figure(views, content.pixel_size, MOST_VIEWS)
     count, chosen = len(views.labels), evenly_chosen(len(views.labels), MOST_VIEWS)
     which = f"{len(chosen)} of {count}" if len(chosen) < count else f"all {count}" if count > 1 else "the one"
-    low, high = grey_limits(views)
+    (low, high), limit = grey_limits(views.measured), largest(views.predicted - views.measured)
     error = float(np.sqrt(np.mean(np.square(np.subtract(views.predicted, views.measured, dtype=np.float64)))))
     text = (
         "Measured intensity, its prediction from the reconstruction, and their difference, for "
         f"{which} held-out view{'s' * (count > 1)}. "
         f"Measured and predicted share the grey scale {low:.3f} to {high:.3f}, the 0.2 and 99.8 percentiles; "
         f"measured values run from {views.measured.min():.3f} to {views.measured.max():.3f}. "
-        f"Colours of differences end at ±{residual_limit(views):.2g}; their root mean square is {error:.2g}. "
+        f"Colours of differences end at ±{limit:.2g}; their root mean square is {error:.2g}. "
         f"Scores use the range of the training frames, {views.scores.data_range[0]:.3f} to "
         f"{views.scores.data_range[1]:.3f}."
     )

@@ -29,10 +29,9 @@ from ..workflows.run_folder import RunFolder
 from .content import DELTA, Quantity, flatten
 from .curves import correlation_figure
 from .figures import richest_planes, slices_figure
-from .page import template
+from .page import Table, duration, resolved, template
 from .run import LARGEST_VOLUME
 from .style import Block, drawn_block, format_length, in_print, scientific
-from .tables import Table, duration, resolved
 
 HEAD = ("", "A", "B")
 ON_THE_WAY = ("decided", "resolved")
@@ -207,10 +206,10 @@ def compare(first: RunFolder, second: RunFolder, scan: Scan | None = None) -> Co
         >>> comparison.scores.dice > 0.8
         True
     """
-    return Comparison(*(_side_of(folder, scan) for folder in (first, second)))
+    return Comparison(*(side_of(folder, scan) for folder in (first, second)))
 
 
-def _side_of(folder: RunFolder, scan: Scan | None) -> Side:
+def side_of(folder: RunFolder, scan: Scan | None) -> Side:
     """A run, at its first time, with its scores on `scan`."""
     folder.require_run()
     result, times = load_reconstruction(folder), instants_of(folder)

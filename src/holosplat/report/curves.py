@@ -118,21 +118,15 @@ def history_figure(history: Mapping[str, np.ndarray]) -> Figure | None:
     step = columns.get("step", np.arange(max((len(c) for c in columns.values()), default=0)))
     terms = [n for n in columns if not n.startswith(NOT_TERMS) and np.any(columns[n] > 0)]
     scores = [n for n in columns if n.startswith("val_") and n[4:] not in ("psnr", "l1") and _has(columns[n])]
+
+    def known(*names: str) -> list[str]:
+        return [name for name in names if name in columns and _has(columns[name])]
+
     panels = [
-        ("Loss", [n for n in ("loss",) if n in columns and _has(columns[n])] + terms, "loss", "log"),
+        ("Loss", known("loss") + terms, "loss", "log"),
         ("Validation scores", scores, "score", "linear"),
-        (
-            "Validation PSNR",
-            [n for n in ("val_psnr",) if n in columns and _has(columns[n])],
-            "PSNR (dB)",
-            "linear",
-        ),
-        (
-            "Primitives",
-            [n for n in ("count",) if n in columns and _has(columns[n])],
-            "number of primitives",
-            "linear",
-        ),
+        ("Validation PSNR", known("val_psnr"), "PSNR (dB)", "linear"),
+        ("Primitives", known("count"), "number of primitives", "linear"),
     ]
     panels = [panel for panel in panels if panel[1]]
     if not panels or len(step) < 2:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,7 +11,6 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from ..geometry import Grid
-from ..metrics import robust_material_delta
 from ..units import length_unit, plain, wavenumber
 from ..volume import Volume
 from .content import DELTA, HeldOutViews, ProjectedMaps, Quantity, pixel_of
@@ -27,12 +24,12 @@ from .style import (
     TRUE_SURFACE,
     WIDTH,
     PanelGrid,
-    colour_bar,
     decimal_scale,
     from_dark,
+    grey_limits,
     image_panel,
+    largest,
     letter,
-    new_figure,
     scale_bar,
     styled,
 )
@@ -88,38 +85,23 @@ def _deviation(truth: Volume, level: float) -> Deviation:
     return Deviation(truth.delta, level, max(truth.grid.voxel_size), lambda d: colours(0.5 + 0.5 * d)[:, :3])
 
 
-def _surface_panel(axes: Axes, shown: SurfaceImage, grid: Grid, close: bool = False) -> None:
-    """The picture in its box; `close`: without the box, and no wider than the matter needs."""
+def _surface_panel(axes: Axes, shown: SurfaceImage, grid: Grid) -> None:
+    """The picture in its box."""
     half = 0.5 * shown.width
     axes.imshow(shown.rgba, extent=(-half, half, half, -half), zorder=2, interpolation="antialiased", aspect="auto")
     axes.set_axis_off()
-    if close:
-        _come_close(axes, shown)
-    else:
-        for points in box_edges(grid, shown.rotation):
-            axes.plot(points[:, 0], points[:, 1], lw=0.5, color=INK, alpha=0.4, zorder=1)
-        axes.set(xlim=(-half, half), ylim=(1.24 * half, -half))  # room for the scale bar below the box
-    left, right = axes.get_xlim()
-    scale_bar(axes, right - left, INK, 0.03)
-
-
-def _come_close(axes: Axes, shown: SurfaceImage) -> None:
-    rows, columns = np.nonzero(shown.rgba[..., 3])
-    if not rows.size:
-        return
-    box = axes.get_window_extent()
-    ratio = box.width / box.height
-    x, y = (0.5 * (i.min() + i.max() + 1) * shown.pixel_size - 0.5 * shown.width for i in (columns, rows))
-    half = 0.53 * max(np.ptp(columns) / ratio, np.ptp(rows)) * shown.pixel_size
-    axes.set(xlim=(x - half * ratio, x + half * ratio), ylim=(y + half, y - half))
+    for points in box_edges(grid, shown.rotation):
+        axes.plot(points[:, 0], points[:, 1], lw=0.5, color=INK, alpha=0.4, zorder=1)
+    axes.set(xlim=(-half, half), ylim=(1.24 * half, -half))  # room for the scale bar below the box
+    scale_bar(axes, 2 * half, INK, 0.03)
 
 
 @styled
 def held_out_figure(views: HeldOutViews, pixel_size: float, most: int = 4) -> Figure:
     """Measured, predicted and residual intensity of up to `most` test views; pixel_size [m]."""
     chosen = evenly_chosen(len(views.labels), most)
-    low, high = grey_limits(views)
-    limit = residual_limit(views)
+    low, high = grey_limits(views.measured)
+    limit = largest(views.predicted - views.measured)
     scale, power = decimal_scale(limit)
     height, width = views.measured.shape[1:]
     panels = PanelGrid(len(chosen), [width] * 3, [height] * 3, (1, 2))
@@ -142,17 +124,6 @@ def held_out_figure(views: HeldOutViews, pixel_size: float, most: int = 4) -> Fi
 def evenly_chosen(count: int, most: int) -> list[int]:
     """At most `most` of `count` indices, evenly spread, the first and the last among them."""
     return sorted({round(i) for i in np.linspace(0, count - 1, min(count, most))})
-
-
-def grey_limits(views: HeldOutViews) -> tuple[float, float]:
-    """The grey scale of holograms: the 0.2 and 99.8 percentiles of the measured test frames."""
-    low, high = np.percentile(views.measured, [0.2, 99.8])
-    return (float(low), float(high)) if high > low else (float(low) - 0.5, float(low) + 0.5)
-
-
-def residual_limit(views: HeldOutViews) -> float:
-    """The residuals' colour limit: the 99.8 percentile of their magnitude."""
-    return float(np.percentile(np.abs(views.predicted - views.measured), 99.8)) or 1.0
 
 
 @styled
@@ -210,7 +181,7 @@ def _projected(
         letter(axes[i], row * len(panels.axes[row]) + column + i, text)
     if len(shown) == 2:
         difference = (shown[1] - shown[0]) / scale
-        limit = float(np.percentile(np.abs(difference), 99.8)) or 1.0
+        limit = largest(difference)
         signed = image_panel(axes[2], difference, pitch, SIGNED_MAP, (-limit, limit))
         panels.bar(signed, 2, (row, row), "difference" + unit, "both")
 
@@ -246,7 +217,7 @@ def slices_figure(
     panels.bar(drawn, 2, (0, len(volumes) - 1), label)
     if truth is not None:
         difference = (reconstruction.delta - truth.delta) / scale
-        limit = float(np.percentile(np.abs(difference), 99.9)) or 1.0
+        limit = largest(difference, 99.9)
         drawn = slice_row(panels.axes[2], difference, truth.grid, positions, SIGNED_MAP, (-limit, limit))
         slice_titles(panels.axes[2], 6, "Difference", truth.grid, positions)
         panels.bar(drawn, 2, (2, 2), f"difference of {label}", "both")
@@ -297,56 +268,3 @@ def slice_titles(axes: list[Axes], first: int, name: str, grid: Grid, positions:
         where = centres[axis][positions[axis]] * factor
         fixed = "zyx"[axis]
         letter(panel, first + i, f"{name}, {plane} at {fixed} = {plain(where, 4)} {unit}".replace("-", "−"))
-
-
-@styled
-def hero_figure(
-    hologram: np.ndarray,
-    pixel_size: float,
-    reconstruction: Volume,
-    truth: Volume | None = None,
-    material: float | None = None,
-) -> Figure:
-    """The banner, 1600 × 500 pixels: a hologram [H, W] of `pixel_size` [m], the surface, and slices of δ.
-
-    material: the material's δ, whose half is the surface; None: its robust value. The slices are the xy and
-    xz planes that hold most matter: the truth above, the reconstruction below.
-    """
-    figure, grid = new_figure(10.0, 3.125, "none"), reconstruction.grid
-    material = robust_material_delta(truth or reconstruction) if material is None else material
-
-    def place(left: float, bottom: float, width: float, height: float) -> Axes:  # [inches]
-        return figure.add_axes((left / 10.0, bottom / 3.125, width / 10.0, height / 3.125))
-
-    first, second = place(0.05, 0.05, 2.8, 2.8), place(2.95, 0.05, 3.5, 2.8)
-    low, high = np.percentile(hologram, [0.2, 99.8])
-    image_panel(first, hologram, (pixel_size, pixel_size), HOLOGRAM_MAP, (float(low), float(high)))
-    scale_bar(first, hologram.shape[1] * pixel_size)
-    letter(first, 0, "Hologram")
-    picture = render_surface(reconstruction.delta, grid, 0.5 * material, camera(), 800, to_rgb(RECONSTRUCTION))
-    _surface_panel(second, picture, grid, close=True)
-    letter(second, 1, "Reconstruction")
-    drawn = _banner_slices(place, reconstruction, truth, material)
-    _, power = decimal_scale(material)
-    colour_bar(figure, drawn, place(9.47, 0.12, 0.085, 2.66), f"δ ({power})" if power else "δ")
-    return figure
-
-
-def _banner_slices(
-    place: Callable[[float, float, float, float], Axes],
-    reconstruction: Volume,
-    truth: Volume | None,
-    material: float,
-) -> AxesImage:
-    grid, planes = reconstruction.grid, richest_planes(truth or reconstruction)
-    scale, _ = decimal_scale(material)
-    limits = value_limits([v.delta / scale for v in (reconstruction, truth) if v is not None])
-    if truth is None:
-        panels = [place(6.6, 0.05, 2.8, 2.8)]
-        letter(panels[0], 2, "Slice of δ")
-        return slice_row(panels, reconstruction.delta / scale, grid, planes, from_dark(DELTA_MAP, limits), limits)
-    for i, (name, volume) in enumerate((("truth", truth), ("reconstruction", reconstruction))):
-        panels = [place(left, 1.56 - 1.51 * i, 1.29, 1.29) for left in (6.72, 8.11)]
-        drawn = slice_row(panels, volume.delta / scale, grid, planes, from_dark(DELTA_MAP, limits), limits)
-        letter(panels[0], 2 + i, f"Slices of δ, {name}")
-    return drawn

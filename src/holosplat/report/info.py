@@ -60,7 +60,7 @@ def info(path: str | Path, reading: Reading = Reading(), picture: Path | None = 
     )
     if scan is not None and picture is not None:
         with uncollected():
-            from .look import look_figure  # needs matplotlib, which takes half a second
+            from .light import look_figure  # needs matplotlib, which takes half a second
 
         with atomic_path(picture) as temporary:
             look_figure(scan).savefig(temporary, format="png")

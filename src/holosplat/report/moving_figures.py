@@ -26,7 +26,9 @@ from .style import (
     PanelGrid,
     decimal_scale,
     drawn_block,
+    grey_limits,
     image_panel,
+    largest,
     letter,
     new_figure,
     scale_bar,
@@ -119,7 +121,7 @@ def film_figure(moving: Moving) -> Figure:
     chosen = evenly_chosen(len(moving.shown), STRIP)
     height, width = moving.measured.shape[1:]
     panels = PanelGrid(4, [width] * len(chosen), [height] * len(chosen), (len(chosen) - 1,))
-    grey, limit = grey_of(moving), residual_of(moving)
+    grey, limit = grey_limits(moving.measured), largest(moving.predicted - moving.measured)
     scale, power = decimal_scale(limit)
     images = []
     for column, k in enumerate(chosen):
@@ -154,17 +156,6 @@ def bodies_panel(axes: Axes, moving: Moving, shown: int) -> None:
     axes.set(xlim=(-half[1], half[1]), ylim=(half[0], -half[0]), xticks=[], yticks=[], aspect="equal")
     for spine in axes.spines.values():
         spine.set(visible=True, linewidth=0.4, color=FAINT)
-
-
-def grey_of(moving: Moving) -> Limits:
-    """The grey scale of frames: the 0.2 and 99.8 percentiles of the measured ones."""
-    low, high = (float(value) for value in np.percentile(moving.measured, [0.2, 99.8]))
-    return (low, high) if high > low else (low - 0.5, low + 0.5)
-
-
-def residual_of(moving: Moving) -> float:
-    """Limit of the colours of differences: the 99.8 percentile of their magnitude."""
-    return float(np.percentile(np.abs(moving.predicted - moving.measured), 99.8)) or 1.0
 
 
 MOST_BYTES = 400_000
@@ -212,10 +203,10 @@ def _picture(moving: Moving, k: int) -> np.ndarray:
     _turned(figure.add_axes((0.0, 0.0, 0.43, 0.93)), moving, k)
     time = 1e6 * float(moving.times[moving.shown[k]])
     figure.text(0.02, 0.93, f"{time:.1f} µs", fontsize=10, weight="bold")
-    limit, pixel = residual_of(moving), float(moving.views[[k]].pixel_sizes[0])
+    limit, pixel = largest(moving.predicted - moving.measured), float(moving.views[[k]].pixel_sizes[0])
     panels = (
-        ("measured", moving.measured[k], HOLOGRAM_MAP, grey_of(moving)),
-        ("predicted", moving.predicted[k], HOLOGRAM_MAP, grey_of(moving)),
+        ("measured", moving.measured[k], HOLOGRAM_MAP, grey_limits(moving.measured)),
+        ("predicted", moving.predicted[k], HOLOGRAM_MAP, grey_limits(moving.measured)),
         ("difference", moving.predicted[k] - moving.measured[k], SIGNED_MAP, (-limit, limit)),
     )
     upright = high > wide  # panels side by side, or one over the other
@@ -277,12 +268,13 @@ def _animation(moving: Moving) -> Block:
 
 
 def _film(moving: Moving) -> Block:
-    figure, (low, high) = film_figure(moving), grey_of(moving)
+    figure, (low, high) = film_figure(moving), grey_limits(moving.measured)
+    limit = largest(moving.predicted - moving.measured)
     rms = float(np.sqrt(np.mean(np.square(np.subtract(moving.predicted, moving.measured, dtype=np.float64)))))
     text = (
         "a, bodies as the beam of the frames below sees them, in the same place and to the same scale. b, measured "
         f"frames; c, what the bodies predict of them; both on the grey scale {low:.3f} to {high:.3f}. d, their "
-        f"difference, whose colours end at ±{residual_of(moving):.2g} and whose root mean square is {rms:.2g}."
+        f"difference, whose colours end at ±{limit:.2g} and whose root mean square is {rms:.2g}."
     )
     return drawn_block("Film strip", text, "Bodies and frames over time.", figure)
 

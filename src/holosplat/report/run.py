@@ -32,7 +32,7 @@ from ..workflows.track import read_errors
 from .content import GuessShown, HeldOutViews, LitViews, Moving, ProjectedMaps, ReportContent, view_labels
 from .figures import evenly_chosen
 from .page import write_report
-from .style import data_uri, new_figure, styled
+from .style import ENDS, data_uri, new_figure, styled
 from .surface import ForecastShown
 from .view3d.view import SLICE_BYTES, VOLUME_BYTES, View3D, part_of, raster_of, volume_part
 
@@ -61,7 +61,8 @@ def report_run(
     if isinstance(found, MovingSurfaces):
         moving = moving_of(reconstruction, scan, evaluation.light, read_errors(folder))
         found = found.at(_middle(moving))
-    grid = truth.grid if truth is not None else _drawn_grid(scan.views)
+    views = scan.views
+    grid = truth.grid if truth is not None else Grid.of_views(views, min(1.0, LARGEST_VOLUME / max(views.shape)))
     held_out, labels = None, np.array(view_labels(scan.views))
     if evaluation.test is not None and evaluation.predicted is not None:
         test = scan.test()
@@ -198,10 +199,6 @@ def _timed(labels: np.ndarray, test: Scan) -> tuple[str, ...]:
     return tuple(f"{label}, {1e6 * time:.4g} µs" for label, time in zip(labels, times))
 
 
-def _drawn_grid(views: Views) -> Grid:
-    return Grid.of_views(views, min(1.0, LARGEST_VOLUME / max(views.shape)))
-
-
 def _lit(reconstruction: Reconstruction, scan: Scan, evaluation: Evaluation) -> LitViews | None:
     """A few training frames with the light that they have beside the prediction; None where light is even."""
     light = evaluation.light
@@ -234,14 +231,10 @@ def _projections(found: Stored, views: Views, truth: Volume | None) -> Projected
         beta, delta = (line.numpy() for line in found.project(chosen))
         if truth is None:
             return ProjectedMaps(beta, delta, labels, pixels=chosen.pixel_sizes)
-        true_beta, true_delta = (line.numpy() for line in _project_volume(truth, chosen).unbind(1))
+        values = torch.stack([torch.from_numpy(truth.beta), torch.from_numpy(truth.delta)])
+        lines = voxel_line_integrals(values, truth.grid, chosen, step=0.5)
+        true_beta, true_delta = (line.numpy() for line in lines.unbind(1))
     return ProjectedMaps(beta, delta, labels, true_beta, true_delta, chosen.pixel_sizes)
-
-
-def _project_volume(truth: Volume, views: Views) -> torch.Tensor:
-    """Line integrals [V, 2, H, W] of β and δ [m]."""
-    values = torch.from_numpy(truth.beta), torch.from_numpy(truth.delta)
-    return voxel_line_integrals(torch.stack(values), truth.grid, views, step=0.5)
 
 
 def moving_of(
@@ -263,10 +256,6 @@ def moving_of(
     box = (middle - half, middle + half)
     shots = (shown, scan.views[chosen], scan.frames[chosen], predicted)
     return Moving(done.object, times, tracks, *box, *shots, errors=errors or {})
-
-
-ENDS = (0.2, 99.8)
-"""Percentiles of the frames between which the grey scale lies."""
 
 
 def view_of(obj: Stored, volume: Volume, truth: Volume | None, scan: Scan, delta_told: bool = True) -> View3D:

@@ -45,6 +45,9 @@ PLAIN = " =:/,;+()!*?@"
 POWER = re.compile(r"(-?\d(?:\.\d+)?)e([+-]\d+)")
 """A number with an exponent."""
 
+ENDS = (0.2, 99.8)
+"""Percentiles at which colours end: single hot pixels do not fade the rest."""
+
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -251,6 +254,17 @@ def colour_bar(figure: Figure, drawn: ScalarMappable, axes: Axes, label: str, ex
     bar.set_label(label if height > 1.2 or len(label) < 15 else label.replace(" (", "\n("), labelpad=3)
     bar.outline.set_linewidth(0.4)  # type: ignore[operator]
     axes.tick_params(length=2, width=0.4, pad=2)
+
+
+def grey_limits(frames: np.ndarray, ends: tuple[float, float] = ENDS) -> tuple[float, float]:
+    """A scale of grey for `frames`, between their percentiles `ends`; it is never empty."""
+    low, high = (float(value) for value in np.percentile(frames, ends))
+    return (low, high) if high > low else (low - 0.5, low + 0.5)
+
+
+def largest(values: np.ndarray, percentile: float = ENDS[1]) -> float:
+    """Where the colours of differences end: a percentile of the magnitude of `values`."""
+    return float(np.percentile(np.abs(values), percentile)) or 1.0
 
 
 def from_dark(colours: str, limits: tuple[float, float]) -> str:

@@ -18,9 +18,8 @@ from PIL import Image
 from ..checks import InputError, require, require_regular
 from ..io.atomic import atomic_path
 from ..io.guard import read_array
-from ..report.page import template
+from ..report.page import Headline, template
 from ..report.style import bar_length, format_length, in_print, scientific, superscript
-from ..report.tables import Headline
 from ..units import in_percent, two_digits
 from ..units import plain as in_digits
 from ..workflows.next_step import next_step

@@ -14,11 +14,10 @@ import torch
 from ..bodies.rest_shape import moments
 from ..checks import InputError, is_of_memory, require
 from ..io.atomic import atomic_path
-from ..io.formats import read_frames
+from ..io.formats import read_frames, run_source
 from ..io.json import write_json
 from ..io.lock import sole_writer
 from ..io.reading import Reading
-from ..io.run_scan import run_source
 from ..matter import MaterialPrior
 from ..methods import Method
 from ..methods.continued import Continued

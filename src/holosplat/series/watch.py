@@ -16,12 +16,11 @@ from typing import Any
 
 from ..checks import InputError, as_written, require
 from ..io.atomic import is_taken, require_parent, write_rows
-from ..io.formats import loader_of, read_frames
+from ..io.formats import loader_of, read_frames, run_source
 from ..io.json import read_json, write_json
 from ..io.leftovers import is_hidden
 from ..io.lock import sole_writer
 from ..io.reading import Reading
-from ..io.run_scan import run_source
 from ..matter import MaterialPrior
 from ..ranges import Positive, Seconds, ranged
 from ..scan import Scan

@@ -10,7 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from ..geometry import Grid
-from ..io.splats import opacities
+from ..io.solids import opacities
 from ..mesh import TriangleMesh
 from ..representations import GaussianCloud, InMotion, Stored, SurfaceMesh, isosurface
 from ..units import bar_length, format_length

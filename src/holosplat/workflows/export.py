@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..geometry import Grid
-from ..io.volume_formats import write_volume_file
+from ..io.formats import write_volume_file
 from ..progress import Advance
 from .reconstruction import Reconstruction
 

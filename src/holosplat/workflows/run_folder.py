@@ -15,10 +15,10 @@ import numpy as np
 from ..checks import as_written, require, require_regular
 from ..display import card, of_object
 from ..io.atomic import atomic_path, require_new, require_parent, write_state
+from ..io.formats import read_marks
 from ..io.json import read_json, write_json
 from ..io.lock import sole_writer
 from ..io.provenance import sha256
-from ..io.run_scan import read_marks
 from ..ranges import require_plausible
 from .provenance import CONFIG_SUM, RUN, config_sum, require_bound, write_manifest
 

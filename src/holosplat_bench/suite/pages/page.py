@@ -10,9 +10,8 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from holosplat.io.atomic import atomic_path
-from holosplat.report.page import template
+from holosplat.report.page import Headline, template
 from holosplat.report.style import DPI, data_uri, styled
-from holosplat.report.tables import Headline
 
 SPECIAL = re.compile(r"([\\`*_<>|\[\]~])")
 """Characters that Markdown would not leave as they are."""

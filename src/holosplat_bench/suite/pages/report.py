@@ -9,8 +9,8 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from holosplat.checks import require
+from holosplat.report.page import Headline, duration
 from holosplat.report.style import format_length, scientific
-from holosplat.report.tables import Headline, duration
 
 from ..folder import BenchFolder, Row
 from ..pictures import TRUTH

@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from holosplat.report.content import flatten
+from holosplat.report.page import Headline, duration
 from holosplat.report.style import (
     CYCLE,
     FAINT,
@@ -24,7 +25,6 @@ from holosplat.report.style import (
     scientific,
     styled,
 )
-from holosplat.report.tables import Headline, duration
 
 from ...suite.pages.page import Page, ScoreTable, Sheet, write_page
 from ...suite.pages.page import Picture as Shown

@@ -1,0 +1,113 @@
+"""`holosplat dataset | train`: simulated scenes in a folder, and from these to the weights of a network."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from ..ranges import Jobs, Seed, Within
+from ..training.options import TrainOptions
+from ..training.ranges import Ranges
+from .places import Kept, Output
+from .progress import ProgressBar
+from .room import tell
+from .sentence import interruptible
+
+if TYPE_CHECKING:
+    from ..planning.needs import Needs
+
+Layout = Literal["nerf-synthetic", "r2-gaussian", "onix"]
+"""Those of `training.export`, which loads torch."""
+
+
+def dataset(
+    out: Kept,
+    count: Annotated[int, Within(1, 10**6)] = 1000,
+    drawn: Annotated[Ranges, OmitArgPrefixes] = Ranges(),
+    seed: Seed = 0,
+    jobs: Jobs = 1,
+    layouts: Annotated[tuple[Layout, ...], arg(name="export")] = (),
+) -> None:
+    """Simulate scenes for learning, drawn at random from stated ranges, into a folder of shards with a datasheet.
+
+    The scene of a number and a seed is always the same; a folder that is there goes on with what it lacks.
+
+    Args:
+        out: Folder to make, or to go on with.
+        count: Number of scenes.
+        seed: Seed of the scenes.
+        jobs: Processes that simulate.
+        layouts: Layouts of other programs into which the scenes are written too, each into a folder of its name in out.
+    """
+    from ..training.export import export
+    from ..training.folder import Dataset, make_dataset
+
+    wanted = Dataset(out, drawn, seed, count)
+    left = sum(map(len, wanted.missing()))
+    fewer = ((f"--jobs {n}", _needs(drawn, left, n)) for n in range(jobs - 1, 0, -1))
+    tell("the dataset", _needs(drawn, left, jobs), out, fewer)
+    with ProgressBar() as bar:
+        with interruptible(lambda: f"interrupted; {out} keeps its whole files, and the same command goes on"):
+            made = make_dataset(wanted, jobs, bar.of("scenes"))
+        done = [
+            export(wanted, layout, lambda part, layout=layout: bar.show(f"{layout} files", part, {}))
+            for layout in layouts
+        ]
+    print(f"wrote {made} files of scenes; {out / 'datasheet.md'} says what they are")
+    for each in done:
+        left_out = f"; left out, for their views have no common axis: {len(each.left_out)}" if each.left_out else ""
+        print(f"wrote {each.count} scene{'s' * (each.count > 1)} into {each.folder}{left_out}")
+
+
+def _needs(drawn: Ranges, scenes: int, jobs: int) -> Needs:
+    """What so many scenes take."""
+    from ..beamline.simulate import Simulation
+    from ..planning.acts import of_dataset
+    from ..planning.needs import of_simulation
+
+    views = drawn.views + drawn.held_out
+    ends = (of_simulation(each, Simulation().samples(each), views) for each in drawn.extremes())
+    return of_dataset(max(ends, key=lambda needs: needs.memory), (drawn.rows, drawn.columns), views, scenes, jobs)
+
+
+def train(
+    data: Positional[Path],
+    out: Output,
+    how: Annotated[TrainOptions, OmitArgPrefixes] = TrainOptions(),
+    resume: bool = False,
+) -> None:
+    """Train a network on scenes of `holosplat dataset`: weights with a card, and curves.
+
+    That of `--start learned`, or, by --network, those of the methods onix and pixelnerf, which see frames alone.
+
+    Args:
+        data: Folder of scenes.
+        out: Folder to make.
+        resume: Go on with an interrupted training; --resume FOLDER alone, with its scenes and options.
+    """
+    from ..planning.acts import of_training
+    from ..report.curves import training_curves
+    from ..training.aligned import AlignedTraining, AlignedValidation
+    from ..training.folder import Dataset
+    from ..training.shown import Validation
+    from ..training.train import Training, made_by
+
+    scenes = Dataset.read(data)
+    scenes.require_whole()
+    frames, views = (scenes.ranges.rows, scenes.ranges.columns), max(how.shown.views)
+    views = min(views, scenes.ranges.views)
+    tell("the training", of_training(frames, views, how.network, how.size, how.steps), out)
+    kind = Training if how.network == "start" else AlignedTraining
+    training = (kind.resumed if resume else kind.begun)(scenes, out, how)
+    who = made_by(how.device)  # before files change under hours of work
+    with ProgressBar() as bar:
+        told = Validation.of(scenes.ranges, scenes.seed, how.validation, bar.of("scenes to validate"))
+        if how.network != "start":
+            told = AlignedValidation(told.samples, network=how.network)
+        with interruptible(lambda: f"interrupted; {out} keeps the last checkpoint, go on with --resume"):
+            training.run(told, lambda now: bar.show("training", now.step / how.steps, now.record))
+    weights = training.finish(told, who)
+    print(f"Dice of scenes of another seed: {told.last()}")
+    print(f"wrote {weights} and {training_curves(out)}")
