@@ -30,6 +30,7 @@ from holosplat.methods import smooth_fit
 from holosplat.methods.illumination import prepared
 from holosplat.methods.method import Task, begun, run_quietly
 from holosplat.methods.volume import SmoothStage
+from holosplat.representations import Stored
 from holosplat_bench.suite.case import load_case
 
 SCENES: tuple[tuple[str, int, float | None], ...] = (
@@ -76,7 +77,7 @@ def ended(case: Case, clearly: float) -> Ended:
         end(self, leg, descent)
 
     with patch.object(smooth_fit, "CLEARLY", clearly), patch.object(smooth_fit.SmoothFit, "_end", noted):
-        found = run_quietly(fit, lambda share: None).voxelise(hs.Grid.of_views(scan.views))
+        found = run_quietly(fit, lambda share: None, Stored).voxelise(hs.Grid.of_views(scan.views))
     absorbs = not float(np.max(case.exposures.distance)) > 0
     one, other = ((v.beta if absorbs else v.delta).astype(np.float64) for v in (found, truth))
     return Ended(float(np.linalg.norm(one - other) / np.linalg.norm(other)), asked[0] if asked else math.nan)

@@ -30,7 +30,7 @@ from holosplat.methods import SmoothVolume
 from holosplat.motion.flow_reconstruction import FlowOptions, merged
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.carried import CarriedScene, Fades
-from holosplat.workflows.moving import reconstruct_moving
+from holosplat.workflows.track import reconstruct_moving
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "data" / "moving_matter.csv"
 SIDE, PIXEL, VIEWS = 64, 0.5e-6, 4

@@ -31,7 +31,7 @@ from machine import commit
 
 import holosplat as hs
 from holosplat.backends import Backend, device_name, resolve
-from holosplat.methods import METHODS, Method
+from holosplat.methods import METHODS
 from holosplat.methods.surface_fit import oversampling
 from holosplat.representations import Stored
 from holosplat.workflows.evaluate import Scores, score_object
@@ -103,15 +103,6 @@ def machine_of(backend: str) -> str:
     return f"{device_name(backend)}, {cores}" if backend == "cuda" else cores
 
 
-def on_backend(name: str, backend: Backend) -> Method:
-    """The method of that name; `TypeError` if it takes no other backend than the usual one."""
-    method = METHODS[name]
-    move = getattr(method, "on_backend", None)
-    if move is None and backend != "auto":
-        raise TypeError(f"{name} takes no backend")
-    return method if move is None else move(backend)  # type: ignore[no-any-return]
-
-
 def measure(
     pixels: int, seed: int, method: str, scene: tuple[int, float], surfaces: bool = False, backend: Backend = "auto"
 ) -> Iterator[dict[str, object]]:
@@ -123,7 +114,9 @@ def measure(
     scan = hs.simulate(cells, hs.Exposures.of(views, 20.0, 0.1, 0.05), seed=seed)
     began, cpu = time.perf_counter(), time.process_time()
     with Peak() as peak:
-        result = hs.reconstruct(scan, hs.MaterialPrior.known(MATERIAL), on_backend(method, backend), seed)
+        chosen = METHODS[method]
+        chosen = chosen.on_backend(backend) if chosen.any_backend or backend != "auto" else chosen
+        result = hs.reconstruct(scan, hs.MaterialPrior.known(MATERIAL), chosen, seed)
     taken = time.perf_counter() - began, time.process_time() - cpu
     grid = hs.Grid.of_views(views)
 

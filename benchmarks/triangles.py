@@ -129,9 +129,7 @@ def to_fine(task: Task, found: SurfaceMesh, variant: Variant) -> tuple[SurfaceMe
         start = prepared(found, at.scan.views.finest, limit, variant.beside)
         options = SurfaceFit(rate=RATE, schedule=replace(SurfaceFit().schedule, steps=steps))
         options = softer(options, start, variant.softer)
-        ended = run_quietly(surface_fit(at.scan, start, options, task.seed), lambda share: None)
-        assert isinstance(ended, SurfaceMesh)
-        found = ended
+        found = run_quietly(surface_fit(at.scan, start, options, task.seed), lambda share: None, SurfaceMesh)
         told[str(at.scan.views.shape[0])] = f"{len(found.faces)} in {time.process_time() - began:.1f} s"
         factor //= 2
     return found, told

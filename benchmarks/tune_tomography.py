@@ -29,7 +29,7 @@ from holosplat.baselines.algebraic import Algebraic, art, sirt
 from holosplat.baselines.filtered_backprojection import Ramp, filtered_backprojection
 from holosplat.baselines.tomography import TOMOGRAPHIES, TotalVariation, total_variation
 from holosplat.matter import Matter
-from holosplat.methods.svmbir import Mbir, svmbir_volume
+from holosplat.methods.per_view import Mbir, svmbir_volume
 from holosplat.metrics import image_scores, intensity_range, volume_scores
 from holosplat.optics.retrieval import RETRIEVALS
 from holosplat.optics.sampling import fringe_sampling

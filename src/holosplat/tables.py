@@ -140,6 +140,16 @@ def to_table(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
+def with_entries(value: Any, entries: Mapping[str, Any]) -> Any:
+    """The dataclass `value` with these values of its fields, and of dataclasses that are its fields, by their names."""
+    changes = {}
+    for name in _fields(type(value)) if _is_dataclass(value) else ():
+        old = getattr(value, name)
+        new = entries[name] if name in entries else with_entries(old, entries)
+        changes |= {} if new is old else {name: new}
+    return dataclasses.replace(value, **changes) if changes else value
+
+
 def merged(table: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     """`table` with the entries of `changes`; inner tables are merged alike, unless the change is of another `kind`."""
     together = table | changes

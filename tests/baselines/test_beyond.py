@@ -16,9 +16,9 @@ from holosplat.fit.smooth_volume import ContinuousPrior, VolumeProblem
 from holosplat.fit.whitened import WhitenedFrames
 from holosplat.geometry import Grid, Views
 from holosplat.matter import MaterialPrior, Matter
-from holosplat.methods.field import field_of
 from holosplat.methods.mass import total_delta
 from holosplat.methods.method import Task
+from holosplat.methods.surface_fit import field_of
 from holosplat.methods.volume import SmoothStage, SmoothVolume
 from holosplat.optics.noise_model import NoiseModel
 from holosplat.optics.retrieval import bounded_estimate

@@ -13,7 +13,7 @@ from holosplat.baselines.algebraic import Algebraic, sirt
 from holosplat.baselines.filtered_backprojection import Ramp, filtered_backprojection
 from holosplat.checks import InputError, MissingError
 from holosplat.geometry import Grid, Views
-from holosplat.methods import svmbir as other
+from holosplat.methods import per_view as other
 from holosplat.projectors.voxels import SliceProjector
 
 SIDE, ROWS = 49, 3

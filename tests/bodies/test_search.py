@@ -13,7 +13,7 @@ from holosplat.bodies.neighbourhood_search import exchanged, pursued
 from holosplat.bodies.poses import Explained, Pose
 from holosplat.bodies.search import best_size
 from holosplat.bodies.templates import Templates, TemplateSearch
-from holosplat.fit.running import Steps
+from holosplat.fit.run import Run
 
 
 def axis_error(found: Pose, turn: np.ndarray) -> float:
@@ -25,12 +25,12 @@ def axis_error(found: Pose, turn: np.ndarray) -> float:
 def test_two_beams_find_a_body_and_its_pose(monkeypatch):
     """One cell that the frames cut at the end: centre, velocity and axis; the steps of another run give the same."""
     truth = pose(TURN, (3.0, 11.0, -2.5), 1.1)
-    flow, steps = FLOW * np.array([0.9, 1.1])[:, None], Steps()
-    (found,), of_begun = pursued(cell(), shadows([truth]), flow, steps=steps)
+    flow, run = FLOW * np.array([0.9, 1.1])[:, None], Run()
+    (found,), of_begun = pursued(cell(), shadows([truth]), flow, run=run)
     assert not of_begun
     with monkeypatch.context() as none:
         none.setattr(Explained, "_better", lambda *given: pytest.fail("these poses were made better before"))
-        ((again,), _) = pursued(cell(), shadows([truth]), flow, steps=Steps(steps.done))
+        ((again,), _) = pursued(cell(), shadows([truth]), flow, run=Run(done=run.done))
     for name in ("matrix", "centre", "velocity", "turning"):
         assert np.array_equal(getattr(again, name), getattr(found, name))
     assert np.linalg.norm(found.centre - truth.centre) < 0.2

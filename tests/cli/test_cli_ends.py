@@ -9,7 +9,7 @@ import pytest
 
 from holosplat.cli import entry
 from holosplat.cli.progress import ASKING, end_as_on_interrupt
-from holosplat.fit.running import interrupts_held
+from holosplat.fit.run import interrupts_held
 
 
 @pytest.fixture

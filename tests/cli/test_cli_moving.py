@@ -10,17 +10,18 @@ import pytest
 
 from helpers.cli import holosplat, worked
 from holosplat.cli import track as motion
+from holosplat.fit.run import Run
 from holosplat.io.nxtomo import read_scan
 from holosplat.io.reading import Reading
 from holosplat.io.volumes import read_volume
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import SmoothVolume
-from holosplat.motion.flow_reconstruction import FlowOptions, FlowSearch
+from holosplat.motion.flow_reconstruction import FlowOptions
 from holosplat.optics.background import LightOptions
 from holosplat.representations import MovingGaussians, SpaceTimeField
-from holosplat.workflows.moving import reconstruct_moving
 from holosplat.workflows.reconstruct import load_reconstruction
 from holosplat.workflows.run_folder import RunFolder
+from holosplat.workflows.track import reconstruct_moving
 
 pytestmark = pytest.mark.usefixtures("unjudged_runs")
 
@@ -79,16 +80,16 @@ def test_a_series_in_motion_is_one_object_that_all_commands_read(quick):
 def test_a_run_that_was_cut_off_goes_on(quick, monkeypatch):
     """Ctrl-C after two steps; the same command with --resume ends it, one with another seed is refused."""
     asked = ["reconstruct", quick / "s.nxs", "--material", "PMMA", "--time-frame", "all", "--out", quick / "run"]
-    keep, kept = FlowSearch.keep, list[int]()
+    keep, kept = Run.keep, list[int]()
 
-    def broken_off(search, state=None):
-        keep(search, state)
+    def broken_off(run):
+        keep(run)
         kept.append(1)
         if len(kept) == 2:
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(FlowSearch, "keep", broken_off)
+        patch.setattr(Run, "keep", broken_off)
         outcome = holosplat(*asked)
     assert outcome.code == 130
     assert "--resume" in outcome.err

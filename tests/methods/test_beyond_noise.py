@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -36,7 +38,7 @@ def judge(frames: Tensor) -> MissingMatter:
 def test_what_noise_may_hide_is_not_missing():
     of_true, missing = judge(TRUE), []
     for seed in range(100):
-        of_true.measured = TRUE + NOISE.drawn(1000 + seed)
+        of_true.scan = replace(of_true.scan, frames=(TRUE + NOISE.drawn(1000 + seed)).float().numpy())
         missing.append(of_true.beyond_noise(TRUE, NOISE))
     assert np.mean([share > 0 for share in missing]) < 0.2  # 2 standard deviations, of 16 draws
     assert of_true.beyond_noise(WRONG, NOISE) > 0
@@ -46,12 +48,11 @@ def test_what_is_left_beyond_noise_is_what_is_left_without():
     """Of an object that is wrong by more than the noise."""
     wrong = TRUE + 0.1 * torch.cat([bump(10, 14, 4), bump(17, 22, 4)])
     noisy = judge(TRUE + NOISE.drawn(5))
-    clean = noisy.squares(TRUE - wrong)[0]
-    assert noisy.beyond_noise(wrong, NOISE) == pytest.approx(clean**0.5, rel=0.2)
+    clean = (noisy.of(TRUE - wrong) / noisy.whole) ** 0.5
+    assert noisy.beyond_noise(wrong, NOISE) == pytest.approx(clean, rel=0.2)
 
 
 def test_frames_without_noise_hide_nothing():
     none = NoiseModel.white_only(torch.zeros(2), SHAPE)
     of_true = judge(TRUE)
-    share = of_true.squares(of_true.measured - WRONG)[0] ** 0.5
-    assert of_true.beyond_noise(WRONG, none) == pytest.approx(share, rel=1e-9)
+    assert of_true.beyond_noise(WRONG, none) == pytest.approx(of_true.share(WRONG), rel=1e-9)

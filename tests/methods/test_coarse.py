@@ -21,12 +21,12 @@ from holosplat.methods import Gaussians, Near, SurfaceOptions, Surfaces, Task, b
 from holosplat.methods.auto import Bodies
 from holosplat.methods.coarse import STAGE as COARSE
 from holosplat.methods.coarse import CoarseToFine, mean_chord, on_pixels, unexplained
-from holosplat.methods.coarse_cloud import cloud_of_surfaces
 from holosplat.methods.first_surfaces import first_surfaces
 from holosplat.methods.gaussian_options import FitOptions
 from holosplat.methods.gaussians import GaussianStage, nearby
 from holosplat.methods.illumination import prepared
 from holosplat.methods.method import run_quietly
+from holosplat.methods.start import cloud_of_surfaces
 from holosplat.methods.surface_fit import SurfaceFit, oversampling
 from holosplat.methods.surfaces import refine_surfaces
 from holosplat.model import measure
@@ -191,8 +191,7 @@ def test_few_steps_on_fine_pixels_end_it(scan, near):
     assert task.near
     fit = last.fit(task, start)
     assert fit is not None
-    found = run_quietly(fit, lambda share: None)
-    assert isinstance(found, SurfaceMesh)
+    found = run_quietly(fit, lambda share: None, SurfaceMesh)
     assert dice(found, body()) > 0.985
     left = measure(found, scan.exposures, 2) - torch.from_numpy(scan.frames)
     assert float(left.square().mean()) < 0.02 * float(np.square(scan.frames - 1).mean())

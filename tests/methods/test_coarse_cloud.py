@@ -15,8 +15,9 @@ from holosplat.geometry import Grid
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.matter import MaterialPrior
 from holosplat.mesh import TriangleMesh
-from holosplat.methods import Task, coarse_cloud
-from holosplat.methods.coarse_cloud import cloud_of_surfaces, matter_in_cells, regions
+from holosplat.methods import Task
+from holosplat.methods import start as coarse_cloud
+from holosplat.methods.start import cloud_of_surfaces, matter_in_cells, regions
 from holosplat.metrics import fourier_ring_correlation
 from holosplat.projectors.surface import surface_occupancy
 from holosplat.representations import GaussianCloud, SurfaceMesh

@@ -20,7 +20,7 @@ from holosplat.methods import Auto, Gaussians, SmoothVolume, Surfaces, Task
 from holosplat.methods.continued import Continued, Effort
 from holosplat.methods.illumination import prepared
 from holosplat.methods.method import run_quietly
-from holosplat.representations import SurfaceMesh, VoxelGrid, approximate, cloud_from_volume
+from holosplat.representations import Stored, SurfaceMesh, VoxelGrid, approximate, cloud_from_volume
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.red_cells import icosphere
 from holosplat.specimens.scene import MeshScene
@@ -80,7 +80,7 @@ def test_matter_follows_its_frames_in_few_steps(scan, tmp_path, kind, left):
     assert middle(start) == pytest.approx(0, abs=0.02)
     fit = stage.fit(task, start)
     assert fit is not None
-    found = run_quietly(fit, lambda share: None)
+    found = run_quietly(fit, lambda share: None, Stored)
     assert found.kind == start.kind
     assert np.linalg.norm(middle(found) - MOVED) < left * np.linalg.norm(MOVED)
 

@@ -31,8 +31,7 @@ def fit_voxels(measured: Scan, start: VoxelGrid, options: VoxelFit, on_progress:
     for stage in Voxels(fit=options).stages()[1:]:
         fit = stage.fit(task, stage.start(task, found))
         assert fit is not None
-        found = run_quietly(fit, task.report(stage.name))
-        assert isinstance(found, VoxelGrid)
+        found = run_quietly(fit, task.report(stage.name), VoxelGrid)
     return found
 
 
@@ -44,9 +43,7 @@ def fit_neural(
     task = Task(measured.train(), KNOWN if matter.single else UNKNOWN, seed, on_progress)
     start = warmed_up(task, matter, thickness, options)
     fit = stage.fit(task, start)
-    found = start if fit is None else run_quietly(fit, task.report(stage.name))
-    assert isinstance(found, NeuralField)
-    return found
+    return start if fit is None else run_quietly(fit, task.report(stage.name), NeuralField)
 
 
 # --- voxels -------------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta, MaterialPrior, Matter
 from holosplat.methods import Gaussians, Task
-from holosplat.methods import level_surfaces as levels
+from holosplat.methods import first_surfaces as levels
 from holosplat.methods.known_levels import KnownLevels
 from holosplat.methods.surface_fit import SurfaceOptions, cut_surfaces
 from holosplat.representations import SurfaceMesh, VoxelGrid

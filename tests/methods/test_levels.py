@@ -241,6 +241,6 @@ def test_a_volume_of_few_rows_has_an_inside(rows):
 def test_missing_matter_counts_what_is_absent(sharp):
     """Nothing leaves about all, and a residual twice as large four times as much."""
     judge = MissingMatter(sharp, MATERIAL)
-    residual = judge.measured - 1
+    residual = torch.from_numpy(sharp.frames) - 1
     assert judge.of(residual) == pytest.approx(judge.whole)
     assert judge.of(2 * residual) == pytest.approx(4 * judge.whole, rel=1e-5)

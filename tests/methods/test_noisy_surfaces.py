@@ -15,10 +15,10 @@ from holosplat.checks import InputError
 from holosplat.fit.schedule import Schedule
 from holosplat.methods import Gaussians, SurfaceOptions, Surfaces, Task
 from holosplat.methods.coarse import CoarseToFine, Way, begun_surfaces, first_of, missing_matter
-from holosplat.methods.coarse_cloud import cloud_of_surfaces
 from holosplat.methods.first_surfaces import first_surfaces, is_noisy, surfaces_of_volume
 from holosplat.methods.gaussian_options import FitOptions
 from holosplat.methods.method import quiet
+from holosplat.methods.start import cloud_of_surfaces
 from holosplat.methods.surface_fit import SurfaceFit
 from holosplat.methods.surfaces import BodiesStage
 from holosplat.representations import SurfaceMesh

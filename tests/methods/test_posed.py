@@ -20,10 +20,9 @@ from holosplat.materials import HAEMOGLOBIN
 from holosplat.matter import MaterialPrior, Matter
 from holosplat.mesh import TriangleMesh
 from holosplat.methods import Gaussians, Task
-from holosplat.methods import learned as methods_learned
-from holosplat.methods import posed as method
+from holosplat.methods import learned as method
+from holosplat.methods.learned import red_cells
 from holosplat.methods.method import Near
-from holosplat.methods.posed import red_cells
 from holosplat.methods.surfaces import BodiesStage
 from holosplat.metrics import volume_scores
 from holosplat.representations import SurfaceMesh
@@ -156,17 +155,17 @@ def test_cells_are_begun_with_where_they_do_better(monkeypatch, better, of):
     vertices = torch.from_numpy(np.concatenate([one for one, _ in parts]))
     made = SurfaceMesh(vertices, torch.from_numpy(faces), PIXEL, Matter.one(*MATERIAL))
     asked = []
-    monkeypatch.setattr(methods_learned, "red_cells", lambda *given: asked.append(given) or made)
+    monkeypatch.setattr(method, "red_cells", lambda *given: asked.append(given) or made)
     taken = better and of == ["red-cells"]
-    powers = {methods_learned.CELLS: 0.5 if better else 2.0, methods_learned.GUESS: 0.5 if taken else 1.0}
+    powers = {method.CELLS: 0.5 if better else 2.0, method.GUESS: 0.5 if taken else 1.0}
 
     def left(self, name: str) -> Score:
         return Score(powers.get(name, 1.0) * np.ones((8, 3)), 2)
 
-    monkeypatch.setattr(methods_learned._Fits, "_score", left)
+    monkeypatch.setattr(method._Fits, "_score", left)
     told = list[Decision]()
     task = Task(scan, PRIOR, on_start=lambda decision, guess: told.append(decision))
     begun = BodiesStage(Gaussians(start="learned").with_effort(0.05)).start(task, None)
     assert len(asked) == (of == ["red-cells"])
-    assert told[0].choice == (methods_learned.CELLS if taken else methods_learned.PLAIN)
+    assert told[0].choice == (method.CELLS if taken else method.PLAIN)
     assert (isinstance(begun, Near) and begun.object is made) == taken

@@ -16,7 +16,7 @@ from helpers.fit_balls import a_cloud, a_scan, fit_of
 from helpers.two_balls import NETWORK, ONE, blurred_start, chords, scan
 from holosplat.fit.density import DensityControl
 from holosplat.fit.loop import Fit
-from holosplat.fit.running import Record
+from holosplat.fit.run import Record
 from holosplat.fit.schedule import Schedule
 from holosplat.fit.terms import Objective
 from holosplat.geometry import Grid

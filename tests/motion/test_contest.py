@@ -12,10 +12,12 @@ import torch
 from helpers.kept import Kept
 from helpers.moving_ellipsoids import MATERIAL, scan, true_paths
 from holosplat.checks import InputError
+from holosplat.fit import run as engine
 from holosplat.inference import Decision, Score
 from holosplat.learning.weights import Card, Trained
 from holosplat.motion import body_tracker, track
-from holosplat.motion.track import NAME, NamedJournal, TrackOptions, compared_kinds, follow, unexplained
+from holosplat.motion.track import NAME, compared_kinds, follow, unexplained
+from holosplat.motion.track_options import TrackOptions
 
 
 class Run:
@@ -81,7 +83,7 @@ def short() -> TrackOptions:
 @pytest.fixture
 def guessed(monkeypatch):
     """Each time sees the true bodies, and a network that knows red cells alone is said to have guessed them."""
-    monkeypatch.setattr(body_tracker, "CHECKPOINT_SECONDS", -1.0)
+    monkeypatch.setattr(engine, "CHECKPOINT_SECONDS", -1.0)
     at = lambda frames, material, options, network: [  # noqa: E731
         body_tracker.Detection(mesh, False) for mesh in true_paths().bodies(float(frames.instants[0]))
     ]
@@ -117,10 +119,14 @@ def test_nobody_asks_for_cells_elsewhere(guessed, monkeypatch):
 
 
 def test_a_journal_of_several():
-    kept, states, stages = Kept(), {}, {"any": {"next": "stiff"}, "cells": {"next": "soft"}}
+    kept, stages = Kept(), {"any": {"next": "stiff"}, "cells": {"next": "soft"}}
+    whole = engine.Run(kept)
     for name, state in stages.items():
-        NamedJournal(kept, states, name).save(state)
-    assert {name: NamedJournal(kept, kept.load(), name).load() for name in stages} == stages  # type: ignore[arg-type]
-    assert NamedJournal(Kept(), {}, "any").load() is None
+        part = whole.part(name)
+        part.state = lambda state=state: state
+        part.keep()
+    again = {name: engine.Run(kept).part(name).saved for name in stages}
+    assert {name: {"next": saved["next"]} for name, saved in again.items()} == stages
+    assert engine.Run(Kept()).part("any").saved == {}
     with pytest.raises(InputError, match="checkpoint"):
         follow(two_beams(), MATERIAL, short(), journal=Kept(["no table"]))  # type: ignore[arg-type]

@@ -108,7 +108,7 @@ def test_what_fades_is_reconstructed_better_where_it_may(way, bound, tmp_path):
     scene, scan = series(drifting(way, Fades(0.5)), 5000.0)
     grid, errors = Grid.of_views(scan.views), []
     for spread in (0.0, 0.3):
-        found = search(scan, spread).run().object
+        found = search(scan, spread).solve().object
         errors.append([error(found.at(t).voxelise(grid), scene.at(t).voxelise(grid)) for t in TIMES])
         assert (found.fading is None) == (spread == 0)
     assert np.mean(errors[1]) < bound * np.mean(errors[0])

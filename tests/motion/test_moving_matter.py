@@ -113,7 +113,7 @@ def test_a_drift_is_found_and_all_times_are_better_than_each_by_itself():
     """In so few photons that single times hardly show the matter."""
     scene, scan = series((4e-6, -2e-6, 3e-6), 300.0)
     how = search(scan, iterations=10, final=24)
-    found, grid = how.run(), Grid.of_views(scan.views)
+    found, grid = how.solve(), Grid.of_views(scan.views)
     moments = range(len(TIMES))
     own = [
         error(how.by_itself(scan.at_instant(k), "one").voxelise(grid), scene.at(TIMES[k]).voxelise(grid))

@@ -9,6 +9,7 @@ import torch
 import holosplat as hs
 from helpers.kept import Kept
 from holosplat.checks import InputError
+from holosplat.fit.run import Run
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import SmoothVolume, Task
 from holosplat.motion.flow_reconstruction import FlowOptions, FlowResult, FlowSearch
@@ -30,9 +31,8 @@ def scan() -> Scan:
 
 
 def found(scan: Scan, journal: Kept) -> FlowResult:
-    search = FlowSearch(Task(scan, MaterialPrior.known(MATTER), seed=2), MATTER, QUICK, journal)
-    search.take_up()
-    return search.run()
+    search = FlowSearch(Task(scan, MaterialPrior.known(MATTER), seed=2), MATTER, QUICK, Run(journal))
+    return search.solve()
 
 
 def test_every_step_is_kept_and_gone_on_from(scan):
@@ -52,6 +52,17 @@ def test_every_step_is_kept_and_gone_on_from(scan):
             assert torch.equal(tensor, result.flow.parameters()[name])
         assert again.history == result.history
         assert again.misfit == result.misfit
+
+
+def test_a_checkpoint_of_an_older_version_is_gone_on_from(scan):
+    """It has the state of the last step beside its number, and no table of steps."""
+    whole = Kept()
+    result = found(scan, whole)
+    kept = whole.states[2]
+    older = {name: value for name, value in kept.items() if name not in ("stage_steps", "fit")}
+    again = found(scan, rest := Kept([older | kept["stage_steps"][-1]]))
+    assert len(rest.states) == len(whole.states) - 2
+    assert torch.equal(again.volume.values, result.volume.values)
 
 
 def test_a_damaged_state_is_named(scan):

@@ -11,6 +11,7 @@ import torch
 
 from helpers.kept import Kept
 from helpers.moving_ellipsoids import MATERIAL, PIXEL, TIMES, scan, true_paths
+from holosplat.fit import run as engine
 from holosplat.fit.schedule import Schedule
 from holosplat.motion import body_tracker, pieces
 from holosplat.motion.fit import motion_fit
@@ -27,7 +28,7 @@ STAGES = ("sightings", "first paths", "stiff", "beside", "paths", "soft", "twins
 @pytest.fixture(autouse=True)
 def frequent(monkeypatch):
     """Fits are kept after every step, and each time sees the true bodies at once."""
-    monkeypatch.setattr(body_tracker, "CHECKPOINT_SECONDS", -1.0)
+    monkeypatch.setattr(engine, "CHECKPOINT_SECONDS", -1.0)
     monkeypatch.setattr(
         body_tracker, "sightings", lambda frames, material, options, network: seen(float(frames.instants[0]))
     )
@@ -87,7 +88,7 @@ def test_the_fit_after_twins_goes_on_too(monkeypatch):
 
 def test_ctrl_c_in_a_fit_loses_no_step(monkeypatch):
     """It is passed on, after the state is kept."""
-    monkeypatch.setattr(body_tracker, "CHECKPOINT_SECONDS", 1e9)
+    monkeypatch.setattr(engine, "CHECKPOINT_SECONDS", 1e9)
 
     def stop(stage, fraction, record):
         if stage == "soft fit" and fraction > 0.5:
@@ -104,7 +105,7 @@ def test_ctrl_c_in_a_fit_loses_no_step(monkeypatch):
 
 def test_times_that_were_looked_at_are_not_looked_at_again(monkeypatch):
     """Cut off by Ctrl-C at the third time, of which nothing is kept."""
-    monkeypatch.setattr(body_tracker, "CHECKPOINT_SECONDS", 1e9)
+    monkeypatch.setattr(engine, "CHECKPOINT_SECONDS", 1e9)
     looked = list[float]()
 
     def look(frames, *given, network):
@@ -123,7 +124,7 @@ def test_times_that_were_looked_at_are_not_looked_at_again(monkeypatch):
 
 
 def test_fits_of_the_choice_of_paths_are_not_made_again(monkeypatch):
-    monkeypatch.setattr(body_tracker, "CHECKPOINT_SECONDS", 1e9)
+    monkeypatch.setattr(engine, "CHECKPOINT_SECONDS", 1e9)
     free, fits = replace(QUICK, paths=PathOptions(degree=1)), list[int]()
     result = follow(scan(), MATERIAL, free, journal=(every := Kept()))
     at = next(k for k, one in enumerate(every.plain) if one["next"] == "paths")

@@ -13,15 +13,15 @@ import holosplat as hs
 from helpers.motion_shadows import OTHER, TURN, cell
 from holosplat.bodies.poses import map_near, twin_map, twin_of
 from holosplat.bodies.rest_shape import moments
-from holosplat.fit.running import Steps
+from holosplat.fit.run import Run
 from holosplat.fit.schedule import Schedule
 from holosplat.geometry import rotation_y
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.matter import Matter
-from holosplat.motion import two_view_ambiguity
+from holosplat.motion import known
 from holosplat.motion.elastic import Elastic, Rest
 from holosplat.motion.fit import MotionFit
-from holosplat.motion.two_view_ambiguity import Trials, chosen_twins, in_question, twinned, without_details
+from holosplat.motion.known import Trials, chosen_twins, in_question, twinned, without_details
 from holosplat.representations import MovingSurfaces, TimeBasis
 
 PIXEL, SHAPE = 1e-6, (29, 35)
@@ -113,13 +113,13 @@ def test_frames_tell_a_body_from_its_twin(monkeypatch):
         assert abs(axes[:, 0] @ turn[:, 2]) > 0.98
     assert heard == sorted(heard)
     assert 0 == heard[0] < heard[-1] < 1
-    told = [*trials.steps.done]
+    told = [*trials.run.done]
     assert len(told) >= 4  # a stiff and a soft fit of a body and of its twin
     with monkeypatch.context() as none:
-        none.setattr(two_view_ambiguity, "motion_fit", lambda *given: pytest.fail("this fit was made before"))
-        again, _ = chosen_twins(twinned(truth, 0, ACROSS), replace(trials, steps=Steps(told)))
+        none.setattr(known, "motion_fit", lambda *given: pytest.fail("this fit was made before"))
+        again, _ = chosen_twins(twinned(truth, 0, ACROSS), replace(trials, run=Run(done=told)))
     assert torch.equal(again.coefficients, found.coefficients)
-    assert chosen_twins(truth, replace(trials, steps=Steps()))[0] is truth
+    assert chosen_twins(truth, replace(trials, run=Run()))[0] is truth
     other = hs.Views.from_angles(np.array([0.0, 30.0, 48.0]), SHAPE, PIXEL)
     three = hs.Exposures.of(other, 20.0, 0.05).repeated(TIMES[:2])
     blank = hs.Scan(np.ones((6, *SHAPE), dtype=np.float32), three, np.zeros(6, dtype=bool))

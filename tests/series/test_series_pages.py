@@ -24,7 +24,7 @@ from holosplat.series.collect import collect, same_bodies
 from holosplat.series.folder import SeriesFolder, duration, table_of, time_left
 from holosplat.series.page import Frame, Point, SeriesPage, chart, headline, labels, render_page
 from holosplat.series.run import run_left, states
-from holosplat.series.time import PHASE
+from holosplat.series.task import PHASE
 from holosplat.workflows.reconstruction import Reconstruction
 
 

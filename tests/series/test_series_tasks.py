@@ -20,7 +20,7 @@ from holosplat.io.lock import TakenError, sole_writer
 from holosplat.io.objects import read_object
 from holosplat.methods import HolographicVoxels
 from holosplat.methods.continued import Continued
-from holosplat.series import time as series_time
+from holosplat.series import task as series_time
 from holosplat.series.folder import SeriesFolder
 from holosplat.series.plan import Settings
 from holosplat.series.run import run_left, states

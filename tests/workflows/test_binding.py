@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import torch
 
-import holosplat.workflows.reconstruct as module
 from helpers.runs import KNOWN, RANDOM, Interruption
 from holosplat.checks import InputError
+from holosplat.fit import run as engine
 from holosplat.geometry import Grid
 from holosplat.io.hdf5_writing import new_hdf5
 from holosplat.io.json import read_json, write_json
@@ -23,7 +23,7 @@ from holosplat.io.objects import write_object
 from holosplat.materials import parse_material
 from holosplat.matter import MaterialPrior, Matter
 from holosplat.representations import VoxelGrid
-from holosplat.workflows.binding import CONFIG_SUM, RESUMED_WITH, RUN, config_sum
+from holosplat.workflows.provenance import CONFIG_SUM, RESUMED_WITH, RUN, config_sum
 from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
 from holosplat.workflows.run_folder import RunFolder
 
@@ -38,7 +38,7 @@ def alter(folder: RunFolder, name: str, value: object) -> None:
 
 def test_a_run_whose_material_was_exchanged_does_not_go_on(scan, tmp_path, monkeypatch):
     """It was killed, so that there is no summary yet; its checkpoint is of the material that it began with."""
-    monkeypatch.setattr(module, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(engine, "CHECKPOINT_SECONDS", 0.0)
     folder = RunFolder(tmp_path / "run")
     with pytest.raises(RuntimeError):
         reconstruct(scan, KNOWN, RANDOM, seed=3, folder=folder, on_progress=Interruption(4, RuntimeError))

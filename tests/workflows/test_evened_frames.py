@@ -16,7 +16,7 @@ from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.optics.patterns import smooth_modes
 from holosplat.projectors.voxels import SliceProjector
 from holosplat.units import wavenumber
-from holosplat.workflows.fixed_pattern import FixedPatternOptions, flatfield_corrected
+from holosplat.workflows.run_illumination import FixedPatternOptions, flatfield_corrected
 
 SHAPE, COUNT, PIXEL = (5, 31), 15, 2e-5
 MATERIAL = hs.DeltaBeta(1e-6, 1e-9)

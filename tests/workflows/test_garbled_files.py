@@ -11,13 +11,13 @@ import pytest
 import torch
 
 from holosplat.checks import InputError
+from holosplat.fit.run import require_alike
 from holosplat.io.reading import Reading
 from holosplat.io.table import Table
 from holosplat.projectors.surface import surface_thickness
 from holosplat.report.info import facts_of_run
 from holosplat.series.folder import Row, read_row, write_row
 from holosplat.specimens.red_cells import icosphere
-from holosplat.workflows.preconditions import require_alike
 from holosplat.workflows.reconstruct import load_reconstruction
 from holosplat.workflows.run_folder import RunFolder
 

@@ -21,7 +21,7 @@ from holosplat.io.hdf5_writing import new_hdf5, put
 from holosplat.io.leftovers import LOCK, host, temporary_name
 from holosplat.io.lock import sole_writer
 from holosplat.workflows.check import check
-from holosplat.workflows.manifest import MANIFEST, faults
+from holosplat.workflows.provenance import MANIFEST, faults
 from holosplat.workflows.run_folder import RunFolder, claimed
 
 

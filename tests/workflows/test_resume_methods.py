@@ -11,13 +11,13 @@ from pathlib import Path
 import pytest
 import torch
 
-import holosplat.workflows.reconstruct as module
 from helpers.runs import KNOWN, PIXEL, RANDOM, scene
 from helpers.short import in_one_go
 from helpers.two_balls import NETWORK
 from helpers.unjudged import unjudged
 from holosplat.baselines import HolographicTV
 from holosplat.beamline.simulate import simulate
+from holosplat.fit import run as engine
 from holosplat.fit.schedule import Schedule
 from holosplat.fit.terms import Objective
 from holosplat.geometry import Views
@@ -191,7 +191,7 @@ def test_an_interrupted_run_is_usable_and_goes_on(scan, case, whole, tmp_path):
 
 
 def test_a_run_that_died_goes_on_from_its_last_checkpoint(scan, case, whole, tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(engine, "CHECKPOINT_SECONDS", 0.0)
     folder = RunFolder(tmp_path / "run")
     with pytest.raises(RuntimeError):
         reconstruct(scan, KNOWN, case.method, seed=3, folder=folder, on_progress=stopping(case, RuntimeError))

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 import torch
 
-import holosplat.workflows.reconstruct as module
 from helpers.runs import CELL, KNOWN, PIXEL, RANDOM, SMALL, STEPS, Interruption
 from holosplat.checks import InputError
+from holosplat.fit import run as engine
 from holosplat.fit.optimiser import Adam
 from holosplat.fit.schedule import Schedule
 from holosplat.matter import DeltaBeta, MaterialPrior, Matter
@@ -247,7 +247,7 @@ def test_ctrl_c_in_the_middle_of_a_step_does_no_harm(scan, random_whole, tmp_pat
 
 def test_a_run_that_died_goes_on_from_its_last_checkpoint(scan, random_whole, tmp_path, monkeypatch):
     """Without a chance to tidy up: metrics.csv then holds rows beyond the checkpoint, which are written anew."""
-    monkeypatch.setattr(module, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(engine, "CHECKPOINT_SECONDS", 0.0)
     folder = RunFolder(tmp_path / "run")
     with pytest.raises(RuntimeError):
         reconstruct(scan, KNOWN, RANDOM, seed=3, folder=folder, on_progress=Interruption(7, RuntimeError))

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..checks import InputError, as_written, in_range, require
-from ..fit.running import interrupts_held
+from ..fit.run import interrupts_held
 from ..io.atomic import atomic_path, require_new
 from ..io.guard import read_archive
 from ..io.json import read_json, write_json

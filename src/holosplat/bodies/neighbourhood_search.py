@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from scipy.sparse import csr_array, vstack
 
-from ..fit.running import Steps
+from ..fit.run import Run
 from ..mesh import TriangleMesh
 from .poses import FREER, Explained, Pose
 from .shadows import Shadows
@@ -218,17 +218,16 @@ def pursued(
     begun: Sequence[Pose] = (),
     seed: int = 0,
     on_progress: Heard = lambda share: None,
-    steps: Steps | None = None,
+    run: Run | None = None,
 ) -> tuple[list[Pose], bool]:
     """Poses of all bodies of the rest shape `mesh` [pixels] that shadows show, on paths near `velocities` [K, 3].
 
     begun: poses that are known about; bodies are found with and without them, and what explains more is made better.
-    The other value: whether that began with them. seed: of the choices of what is taken away. steps: in which it is
-    done.
+    The other value: whether that began with them. seed: of the choices of what is taken away. run: keeps the steps.
     """
-    steps = steps or Steps()
-    search, every = TemplateSearch(Templates.of(mesh, seen), seen, velocities), Explained(mesh, seen, steps=steps)
-    free = Explained(mesh, seen, FREER, steps)
+    run = run or Run()
+    search, every = TemplateSearch(Templates.of(mesh, seen), seen, velocities), Explained(mesh, seen, run=run)
+    free = Explained(mesh, seen, FREER, run)
     starts = [[], every.improved(begun, LAST_STEPS)] if begun else [[]]
     found = [free.improved(searched(every, search, start), LAST_STEPS) for start in starts]
     best = int(np.argmin([free.value(poses) for poses in found]))

@@ -19,7 +19,7 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
-from ..fit.running import Steps
+from ..fit.run import Run
 from ..geometry import Views
 from ..mesh import TriangleMesh
 from .shadows import Shadows
@@ -66,12 +66,12 @@ class Pose:
 class Explained:
     """The residual shadows of bodies of one rest shape, and their cost.
 
-    strain: cost of a squared strain of one; steps: of the calculation, one for each time that poses are `improved`.
+    strain: cost of a squared strain of one; run: whose step each improvement of poses is.
     """
 
-    def __init__(self, mesh: TriangleMesh, seen: Shadows, strain: float = STRAIN, steps: Steps | None = None) -> None:
+    def __init__(self, mesh: TriangleMesh, seen: Shadows, strain: float = STRAIN, run: Run | None = None) -> None:
         radius = (3 * mesh.volume / (4 * np.pi)) ** (1 / 3)
-        self.mesh, self.seen, self.steps = mesh, seen, steps or Steps()
+        self.mesh, self.seen, self.run = mesh, seen, run or Run()
         self.noise = max(seen.noise, MODEL_ERROR * radius)
         self.target, self.rest = torch.from_numpy(seen.thickness), torch.from_numpy(mesh.vertices)
         self.radius = float(self.rest.norm(dim=1).mean())
@@ -87,7 +87,7 @@ class Explained:
 
     def beside(self, images: np.ndarray) -> Explained:
         """The same beside matter that casts `images` [N, H, W]."""
-        return Explained(self.mesh, self.seen.without(images), self.strain, self.steps)
+        return Explained(self.mesh, self.seen.without(images), self.strain, self.run)
 
     def without(self, poses: Sequence[Pose]) -> Explained:
         """The same beside bodies in `poses`."""
@@ -156,7 +156,7 @@ class Explained:
 
     def improved(self, poses: Sequence[Pose], steps: int) -> list[Pose]:
         """Poses that explain more, by so many steps of L-BFGS."""
-        return _poses(_unpacked(self.steps.of(lambda: self._better(_parts(poses), steps)))) if poses else []
+        return _poses(_unpacked(self.run.step("poses", lambda: self._better(_parts(poses), steps)))) if poses else []
 
     def _better(self, first: Parts, steps: int) -> Tensor:
         """The same of the parts of poses, packed."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from ..fit.running import Steps
+from ..fit.run import Run
 from ..matter import DeltaBeta
 from ..mesh import TriangleMesh
 from ..scan import Scan
@@ -48,19 +48,19 @@ class BodySearch:
         size: float = 1.0,
         seed: int = 0,
         on_progress: Heard = lambda share: None,
-        steps: Steps | None = None,
+        run: Run | None = None,
     ) -> tuple[list[Pose], bool]:
         """Poses of bodies `size` times as large, on paths near `velocities` [K, 3], and whether the search began with
         bodies in the poses `like` (`pursued`); all in pixels of the search."""
-        return pursued(sized(self.mesh, size), self.seen, velocities, like, seed, on_progress, steps)
+        return pursued(sized(self.mesh, size), self.seen, velocities, like, seed, on_progress, run)
 
     def of_best_size(
-        self, poses: Sequence[Pose], size: float = 1.0, steps: Steps | None = None
+        self, poses: Sequence[Pose], size: float = 1.0, run: Run | None = None
     ) -> tuple[float, list[Pose]]:
         """The size of all bodies within `body.uncertain` of `size` that explains most in `poses`, and better poses."""
         mesh = sized(self.mesh, size)
         size *= best_size(mesh, self.seen, poses, self.body.uncertain)
-        return size, Explained(sized(self.mesh, size), self.seen, FREER, steps).improved(poses, SIZE_STEPS)
+        return size, Explained(sized(self.mesh, size), self.seen, FREER, run).improved(poses, SIZE_STEPS)
 
     def like(self, mesh: TriangleMesh, pixel: float) -> Pose:
         """A body at rest that is stretched like `mesh` [m], and has its middle; pixel: of the frames [m]."""

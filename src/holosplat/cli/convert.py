@@ -22,7 +22,7 @@ from ..methods.method import STAND_IN_RATIO, shows_no_refraction
 from ..optics import retrieve_thickness
 from ..ranges import Metres, Natural, Positive, ranged
 from ..scan import Scan
-from ..workflows.fixed_pattern import FixedPatternOptions, flatfield_corrected
+from ..workflows.run_illumination import FixedPatternOptions, flatfield_corrected
 from .options import PriorOptions
 from .places import Output
 from .progress import ProgressBar

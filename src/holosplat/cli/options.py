@@ -287,10 +287,7 @@ class MethodOptions:
             where = "start" if isinstance(method, Gaussians) else "gaussians.start"
             method = chosen_method(self.method, self.preset, self.config, (*self.changes, f"{where}={self.start}"))
         if self.backend:
-            move = getattr(method, "on_backend", None)
-            if move is None:
-                raise InputError(f"the method {method.kind} runs on the CPU only; leave --backend.")
-            method = move(self.backend)
+            method = method.on_backend(self.backend)
         resolve(self.backend or "auto")  # before the start, which takes its time
         return method
 

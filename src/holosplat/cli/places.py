@@ -27,7 +27,7 @@ from ..io.leftovers import LOCK
 from ..io.lock import require_unwritten
 from ..io.provenance import NAME, Command, beside, carried_out, records
 from ..ranges import flag, hints_of, with_checked_numbers
-from ..workflows.manifest import MANIFEST
+from ..workflows.provenance import MANIFEST
 
 WRITTEN = "written"
 Output = Annotated[Path, WRITTEN]

@@ -23,10 +23,9 @@ from ..ranges import Metres, Seed, Share, Weight, ranged
 from ..report.run import report_run
 from ..scan import Scan
 from ..workflows.evaluate import evaluate as score
-from ..workflows.moving import begun_in_motion, reconstruct_moving
 from ..workflows.reconstruction import Reconstruction, reconstruction_at
 from ..workflows.run_folder import RunFolder, claimed
-from ..workflows.track import BODIES, COLLECTION, TRACKS
+from ..workflows.track import BODIES, COLLECTION, TRACKS, begun_in_motion, reconstruct_moving
 from ..workflows.track import track as follow
 from .light import LightFlags
 from .options import PriorOptions

@@ -22,7 +22,7 @@ from ..model import Model
 from .optimiser import Leaves, Optimiser, Trainable
 from .problem import Batch, Batches, CapturedStep, Problem
 from .residuals import Judge
-from .running import Record, interrupts_held
+from .run import Record, interrupts_held
 from .schedule import Schedule
 
 UNREAD_STEPS = 20

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ..checks import at_least, require
 from ..ranges import ranged
@@ -44,6 +44,10 @@ class Schedule:
         at_least(self, 1, "volume_every", "validate_every")
         at_least(self, 2, "volume_edge")
         require(0 < self.decay <= 1, f"decay must lie in (0, 1], but it is {self.decay}.")
+
+    def with_effort(self, effort: float) -> Schedule:
+        """The same with `effort` times the steps, at least one."""
+        return replace(self, steps=max(1, round(effort * self.steps)))
 
     def share(self, step: int, seconds: float) -> float:
         """What share of the fit is done after `step` steps and `seconds` [s]: 1 and it ends."""

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import ClassVar
 
-from ..backends import Backend
 from ..checks import InputError
 from ..fit.loop import Fit
 from ..matter import MatterKind
@@ -25,6 +24,7 @@ class Auto(Method):
     """Matter with levels: Gaussians, and closed surfaces where there are bodies. Continuous matter: a smooth volume."""
 
     kind: ClassVar[str] = "auto"
+    any_backend: ClassVar[bool] = True
     mixes_kinds: ClassVar[bool] = True
     """A volume may take the place of bodies."""
     two_sided: ClassVar[bool] = True
@@ -49,15 +49,6 @@ class Auto(Method):
     def require_files(self) -> None:
         """Those of the Gaussians."""
         self.gaussians.require_files()
-
-    def on_backend(self, backend: Backend) -> Auto:
-        """The same method computed by `backend`."""
-        return replace(
-            self,
-            gaussians=self.gaussians.on_backend(backend),
-            surfaces=replace(self.surfaces, fit=replace(self.surfaces.fit, backend=backend)),
-            volume=self.volume.on_backend(backend),
-        )
 
     def with_effort(self, effort: float) -> Auto:
         """The same method with `effort` times the steps, at least one."""

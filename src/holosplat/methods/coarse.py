@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from ..backends import resolve
 from ..checks import at_least
 from ..matter import DeltaBeta
 from ..optics.noise import noise_levels
@@ -23,9 +22,9 @@ from ..ranges import Pixels, Positive, Share, Weight, ranged
 from ..representations import GaussianCloud, SurfaceMesh
 from ..representations.isosurface import edge_lengths, loop_subdivision
 from ..scan import Scan
-from .cross_validation import MissingMatter, predicted_frames
+from .cross_validation import MissingMatter
 from .method import Task, run_quietly
-from .surface_fit import SurfaceFit, SurfaceOptions, oversampling, softened, surface_fit
+from .surface_fit import SurfaceFit, SurfaceOptions, frames_of, softened, surface_fit
 
 STAGE = "coarse pixels"
 FEWEST_ROWS = 32
@@ -204,9 +203,7 @@ def _fitted(task: Task, found: SurfaceMesh, surfaces: SurfaceOptions, how: Coars
 
 def _run(task: Task, start: SurfaceMesh, options: SurfaceFit) -> SurfaceMesh:
     fit = surface_fit(task.scan, start, options, task.seed, task.uneven)
-    found = run_quietly(fit, task.report(f"{STAGE}: surfaces"))
-    assert isinstance(found, SurfaceMesh)
-    return found
+    return run_quietly(fit, task.report(f"{STAGE}: surfaces"), SurfaceMesh)
 
 
 def on_pixels(mesh: SurfaceMesh, pixel: float, edge: float) -> SurfaceMesh:
@@ -231,8 +228,7 @@ def unexplained(mesh: SurfaceMesh, scan: Scan, surfaces: SurfaceOptions) -> floa
     """Part of the power of the frames' finest structure that `mesh` leaves unexplained, noise taken off; 0 where noise
     hides all of it. Finest is what two pixels in one do not show."""
     measured = torch.from_numpy(scan.frames).double()
-    mesh = mesh.on(resolve(surfaces.fit.backend))
-    predicted = predicted_frames(scan.exposures, mesh, oversampling(scan, surfaces.fit)).double()
+    predicted = frames_of(mesh, scan, surfaces.fit).double()
     noise = 0.75 * float(noise_levels(scan.measured).square().mean())  # one of four orthogonal patterns is left out
     seen, left = (float(_finest(frames).square().mean()) - noise for frames in (measured, measured - predicted))
     return 0.0 if seen <= DOUBT * noise else max(left - DOUBT * noise, 0.0) / seen
@@ -242,8 +238,7 @@ def missing_matter(found: SurfaceMesh | GaussianCloud, task: Task, surfaces: Sur
     """Share of all matter in the frames of `task` that `found` leaves unexplained; 0 where noise may hide all of it
     (`MissingMatter.beyond_noise`)."""
     judge = MissingMatter(task.scan, DeltaBeta(found.matter.delta, found.matter.beta))
-    there = found.on(resolve(surfaces.fit.backend))
-    return judge.beyond_noise(judge.predicted(there, oversampling(task.scan, surfaces.fit)), task.noise)
+    return judge.beyond_noise(frames_of(found, task.scan, surfaces.fit), task.noise)
 
 
 def _finest(frames: Tensor) -> Tensor:

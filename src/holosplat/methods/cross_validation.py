@@ -14,6 +14,7 @@ from ..memory import memory_kept
 from ..model import Instrument, Model
 from ..optics.noise_model import NoiseModel
 from ..optics.sampling import alike, fringe_sampling
+from ..representations import Stored
 from ..scan import Exposures, Scan
 from ..volume import Object
 
@@ -28,7 +29,7 @@ def predicted_frames(exposures: Exposures, obj: Object, oversample: int = 0) -> 
 
     oversample: wave samples a pixel (0: as the first fringe needs).
     """
-    samples, backend = oversample or fringe_sampling(exposures), getattr(obj, "backend", "cpu")
+    samples, backend = oversample or fringe_sampling(exposures), obj.backend if isinstance(obj, Stored) else "cpu"
     frames = torch.empty(len(exposures), *exposures.views.shape)
     with torch.no_grad(), memory_kept():
         for views in alike(exposures, samples):
@@ -46,48 +47,23 @@ class MissingMatter:
     """
 
     def __init__(self, scan: Scan, material: DeltaBeta) -> None:
-        self.scan = scan
-        self.measured = torch.from_numpy(scan.frames)
-        self._correction = Correction(scan, material)
-        even = scan.left(torch.ones(()))
-        self.whole = self.of(even)
+        self.scan, self._correction = scan, Correction(scan, material)
+        self.whole = max(self.of(scan.left(torch.ones(()))), np.finfo(float).tiny)
         """Mean square of all matter in the frames [m²]."""
-        self.contrast = max(float(even.double().square().mean()), np.finfo(float).tiny)
-        """Mean square of their contrast."""
-
-    def predicted(self, obj: Object, oversample: int = 0) -> Tensor:
-        """Frames [V, H, W] of `obj`, some views at a time to bound memory.
-
-        oversample: wave samples a pixel (0: as the first fringe needs).
-        """
-        return predicted_frames(self.scan.exposures, obj, oversample)
 
     def of(self, residual: Tensor) -> float:
         """Mean square [m²] of the thickness that explains residuals [V, H, W] of intensity."""
-        return float(self.matter(residual).square().mean())
+        return float(self._correction(residual).double().square().mean())
 
-    def matter(self, residual: Tensor) -> Tensor:
-        """The thickness [V, H, W] [m] itself, float64; linear in the residuals."""
-        return self._correction(residual).double()
-
-    def share(self, obj: Object) -> float:
-        """Root of the part of all matter that `obj` leaves unexplained: 0 for a perfect object, about 1 for none."""
-        return self.shares(obj)[0]
-
-    def shares(self, obj: Object, oversample: int = 0) -> tuple[float, float]:
-        """The same of matter, and of the contrast of the frames. oversample: as for `predicted`."""
-        matter, contrast = self.squares(self.scan.left(self.predicted(obj, oversample)))
-        return math.sqrt(matter), math.sqrt(contrast)
+    def share(self, predicted: Tensor) -> float:
+        """Root of the part of all matter that predicted frames [V, H, W] leave unexplained: 0 for those of a perfect
+        object, about 1 for even light."""
+        return math.sqrt(self.of(self.scan.left(predicted)) / self.whole)
 
     def beyond_noise(self, predicted: Tensor, noise: NoiseModel) -> float:
         """Root of the part of all matter that predicted frames [V, H, W] leave unexplained beyond `noise`; 0 where
         that may hide all of it, by `HIDDEN` standard deviations."""
         draws = torch.tensor([self.of(noise.drawn(seed)) for seed in range(DRAWS)], dtype=torch.float64)
-        left = (self.of(self.scan.left(predicted)) - float(draws.mean())) / max(self.whole, np.finfo(float).tiny)
-        deviation = float(draws.std(correction=0)) / max(self.whole, np.finfo(float).tiny)
+        left = (self.of(self.scan.left(predicted)) - float(draws.mean())) / self.whole
+        deviation = float(draws.std(correction=0)) / self.whole
         return math.sqrt(left) if left > HIDDEN * deviation else 0.0
-
-    def squares(self, residual: Tensor) -> tuple[float, float]:
-        """Squares of the parts of all matter, and of the contrast, that residuals [V, H, W] of intensity stand for."""
-        intensity = float(residual.double().square().mean())
-        return self.of(residual) / max(self.whole, np.finfo(float).tiny), intensity / self.contrast

@@ -1,25 +1,29 @@
-"""The first surfaces of closed bodies: those of a first volume, or of Gaussians."""
+"""The first surfaces of closed bodies: those of a first volume, of Gaussians, or of guessed levels."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
+from itertools import combinations
 
 from torch import Tensor
 
 from ..baselines import holographic_tv
-from ..checks import InputError
+from ..checks import InputError, require
 from ..geometry import Grid
+from ..inference import Score, select
 from ..matter import Matter
 from ..optics.noise import noise_share
-from ..representations import GaussianCloud, SurfaceMesh
+from ..representations import GaussianCloud, SurfaceMesh, VoxelGrid
 from .coarse import Way, settled, unexplained
 from .gaussian_options import GaussianOptions
-from .level_surfaces import surfaces_of_levels
+from .keeper import BY
 from .method import Task
 from .sharp_level import material_of_levels
-from .surface_fit import SurfaceOptions, cut_surfaces, extract_surfaces
+from .surface_fit import SurfaceOptions, cut_surfaces, extract_surfaces, frames_of
 from .turns import cut_as_seen, in_turns
+from .volume import SmoothStage, SmoothVolume
 
 
 def first_surfaces(
@@ -105,3 +109,48 @@ def _of_volume(task: Task, options: GaussianOptions, surfaces: SurfaceOptions) -
 def is_noisy(task: Task, options: GaussianOptions) -> bool:
     """Whether the frames of `task` are too noisy to make a volume agree with them."""
     return noise_share(task.scan.measured) > options.volume.noisy
+
+
+NAME, STAGE = "materials", "likeliest volume"
+
+
+def surfaces_of_levels(task: Task, options: GaussianOptions, surfaces: SurfaceOptions) -> SurfaceMesh:
+    """Surfaces of the known materials of `task`, or of fewer of them where more explain no more of the frames.
+
+    They are cut out of the likeliest volume, whose prior knows their levels, one inside another, fitted to the frames
+    together, and take turns with a volume. Fewer materials are the null. Errors: `InputError` where none has a surface.
+    """
+    volume = _likeliest(task, options)
+    found = dict[str, SurfaceMesh]()
+    materials = task.prior.materials
+    for count in range(1, len(materials) + 1):
+        for chosen in combinations(range(len(materials)), count):
+            with suppress(InputError):  # one of them has no surface
+                matter = Matter.several(*(materials[k] for k in chosen))
+                name = "δ " + " and ".join(f"{delta:.3g}" for delta, _ in matter.channels)
+                found[name] = _of_levels(task, volume, matter, options, surfaces)
+    require(len(found) > 0, "the volume holds no surface of the known materials.")
+
+    def scored(name: str, fold: int) -> Score:
+        return Score.of(task.scan.left(frames_of(found[name], task.scan, surfaces.fit).double()))
+
+    decision = select(NAME, tuple(found), scored, by=BY)
+    task.on_start(decision, None)
+    return in_turns(task, found[decision.choice], options, surfaces)
+
+
+def _likeliest(task: Task, options: GaussianOptions) -> VoxelGrid:
+    stage = SmoothStage(SmoothVolume(volume=replace(SmoothVolume().volume, backend=options.volume.backend)))
+    fit = stage.fit(task, stage.start(task, None))
+    fit.run(lambda record: task.on_progress(STAGE, fit.share))
+    return fit.voxels
+
+
+def _of_levels(
+    task: Task, volume: VoxelGrid, matter: Matter, options: GaussianOptions, surfaces: SurfaceOptions
+) -> SurfaceMesh:
+    """Surfaces of `matter`, cut out of a `volume` and settled."""
+    occupancy = volume.values[0].cpu() * (volume.matter.delta / matter.delta)
+    cut = cut_as_seen(task, occupancy, volume.grid, matter, surfaces)
+    how = options.coarse.of_views(len(task.scan.train()))
+    return settled(task, cut, surfaces, how)

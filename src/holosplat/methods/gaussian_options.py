@@ -40,17 +40,15 @@ class GaussianRates:
         return {f"object.{name}": 0.0 if name in still else rate * factor for name, rate in vars(self).items()}
 
 
-def _objective() -> Objective:
-    return Objective(
-        l1=1.0, tv_volume=0.25, overfull=10.0, two_levels=1.25, noise_gain=0.5, noise_width=1.0, coarse=1.0
-    )
-
-
 @dataclass(frozen=True)
 class FitOptions:
     """What is minimised, how, where Gaussians come and go, and which backend does it (see `backends`)."""
 
-    objective: Objective = field(default_factory=_objective)
+    objective: Objective = field(
+        default_factory=lambda: Objective(
+            l1=1.0, tv_volume=0.25, overfull=10.0, two_levels=1.25, noise_gain=0.5, noise_width=1.0, coarse=1.0
+        )
+    )
     schedule: Schedule = field(default_factory=Schedule)
     rates: GaussianRates = field(default_factory=GaussianRates)
     density: DensityControl = field(default_factory=DensityControl)

@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 import torch
 
-from ..backends import Backend, resolve
+from ..backends import resolve
 from ..baselines.beyond import rows_of
 from ..fit.density import DensityEvent
 from ..fit.loop import Fit, Plan
@@ -27,15 +27,13 @@ from ..representations import GaussianCloud, Stored, SurfaceMesh
 from ..scan import Scan
 from .coarse import STAGE as COARSE
 from .coarse import CoarseToFine, Way, coarse_surfaces, last_steps
-from .coarse_cloud import cloud_of_surfaces
-from .field import field_of
 from .first_surfaces import first_surfaces
 from .gaussian_options import FitOptions, GaussianOptions, GaussianRates
 from .ground import Ground, ground
 from .learned import guessed_start, ways_of_guess
 from .method import Method, Near, Stage, Task, run_quietly
-from .start import starting_cloud
-from .surface_fit import SurfaceFit, SurfaceOptions, oversampling
+from .start import cloud_of_surfaces, starting_cloud
+from .surface_fit import SurfaceFit, SurfaceOptions, field_of, oversampling
 
 
 @dataclass(frozen=True)
@@ -58,6 +56,7 @@ class Gaussians(GaussianOptions, Method):
     """
 
     kind: ClassVar[str] = "gaussians"
+    any_backend: ClassVar[bool] = True
 
     def stages(self) -> tuple[Stage, ...]:
         """One: the start, and the fit."""
@@ -74,15 +73,9 @@ class Gaussians(GaussianOptions, Method):
         weights = self.fit.objective
         return self.start != "random" or weights.overfull > 0 or weights.two_levels > 0
 
-    def on_backend(self, backend: Backend) -> Gaussians:
-        """The same method computed by `backend`, the start, too."""
-        volume = replace(self.volume, backend=backend)
-        return replace(self, fit=replace(self.fit, backend=backend), volume=volume)
-
     def with_effort(self, effort: float) -> Gaussians:
         """The same method with `effort` times the steps, at least one."""
-        steps, first = (max(1, round(effort * n)) for n in (self.fit.schedule.steps, self.approximate_steps))
-        schedule = replace(self.fit.schedule, steps=steps)
+        first, schedule = max(1, round(effort * self.approximate_steps)), self.fit.schedule.with_effort(effort)
         coarse, fit = self.coarse.with_effort(effort), replace(self.fit, schedule=schedule)
         return replace(self, approximate_steps=first, fit=fit, coarse=coarse)
 
@@ -150,9 +143,7 @@ class GaussianStage:
         fit, schedule = self.options.fit, self.options.fit.schedule
         short = replace(fit, schedule=replace(schedule, steps=min(steps, schedule.steps), validation_views=0))
         run = GaussianStage(replace(self.options, fit=short)).fit(replace(task, near=False, freedom=None), cloud)
-        found = run_quietly(run, task.report(self.name))
-        assert isinstance(found, GaussianCloud)
-        return found
+        return run_quietly(run, task.report(self.name), GaussianCloud)
 
     def fit(self, task: Task, start: Stored) -> Fit:
         """The fit of the cloud to the training frames."""
@@ -186,9 +177,7 @@ class GaussianStage:
         """The cloud fitted to the frames of `task`."""
         start = self.own_start(task)
         assert isinstance(start, GaussianCloud)
-        found = run_quietly(self.fit(task, start), task.report(f"{COARSE}: Gaussians"))
-        assert isinstance(found, GaussianCloud)
-        return found
+        return run_quietly(self.fit(task, start), task.report(f"{COARSE}: Gaussians"), GaussianCloud)
 
 
 def resolved(options: FitOptions, task: Task, matter: Matter) -> FitOptions:

@@ -54,6 +54,10 @@ class Ground:
     frames: FrameTerm
     judge: Judge | None
 
+    def in_noise(self, weight: float, more: float) -> float:
+        """`weight`, and `more` for every pixel of thickness that the noise of the frames amounts to."""
+        return weight + more * (0.0 if self.frames.spectral is None else self.frames.spectral.noise)
+
     def extra(self, terms: tuple[ExtraTerm, ...]) -> list[Term]:
         """The terms that are asked for by name."""
         return [TERMS[term.name](term.weight, self.model, self.train) for term in terms]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, cast
@@ -71,18 +70,15 @@ class Keeper:
         compared, best = tuple(self.compared), self.best
         return (Decision(NAME, best.name, self.by, compared),) if best and compared else ()
 
-    def moved(self, train: Scan) -> None:
-        """The training frames are elsewhere from now on."""
-        if train.exposures is not self.train.exposures:
-            self.train, self._judge = train, None
-
-    def look(self, name: str, found: Stored, oversample: int, fitted: bool = True) -> None:
+    def look(self, name: str, found: Stored, oversample: int, fitted: bool = True, train: Scan | None = None) -> None:
         """Take in the latest state. What is not `fitted` is a step of the method, and takes the place of all others
-        unless it has lost the matter."""
+        unless it has lost the matter. train: the training frames, where they are elsewhere from now on."""
+        if train is not None and train.exposures is not self.train.exposures:
+            self.train, self._judge = train, None
         if self._judge is None:
             self._judge = MissingMatter(self.train, _material(self.best.object if self.best else found))
         state = State.of(name, found, oversample, self.train.exposures)
-        self.judged[name] = math.sqrt(self._judge.squares(self.train.left(state.predicted))[0])
+        self.judged[name] = self._judge.share(state.predicted)
         if self._wins(state, fitted):
             self.best = state
 

@@ -23,20 +23,6 @@ from .method import Method, Task, run_stages, unheard
 STAGE = "kinds of results"
 
 
-class _LastOfEachKind:
-    """The last state of each kind of Objects in a run, and its wave samples a pixel."""
-
-    def __init__(self) -> None:
-        self.states: dict[str, tuple[Stored, int]] = {}
-
-    def look(self, name: str, found: Stored, oversample: int, fitted: bool = True) -> None:
-        """Keep this one."""
-        self.states[found.kind] = found, oversample
-
-    def moved(self, train: Scan) -> None:
-        """Poses are not free here."""
-
-
 def unseen_kinds(task: Task, method: Method) -> Unseen | None:
     """What decides between kinds of results of a run; None where there is one kind, or where poses are free, for those
     of unseen views are not known."""
@@ -55,11 +41,15 @@ def decide_kind(task: Task, method: Method, null: str, other: str) -> Decision:
     def scores(fold: int) -> dict[str, Score]:
         seen, unseen = folds.split(fold)
         lit = task.lit and task.lit.part(torch.from_numpy(folds.kept(fold)), folds.binning)
-        last = _LastOfEachKind()
+        last = dict[str, tuple[Stored, int]]()
+
+        def look(name: str, found: Stored, oversample: int, fitted: bool, train: Scan) -> None:
+            last[found.kind] = found, oversample
+
         part = replace(task, scan=seen, lit=lit, first=None, near=False, on_start=unheard)
         with suppress(NoMatterError):  # what is made before it stands
-            run_stages(method.with_effort(EFFORT), part, last)
-        expected = {kind: predicted_frames(unseen.exposures, *state) for kind, state in last.states.items()}
+            run_stages(method.with_effort(EFFORT), part, look)
+        expected = {kind: predicted_frames(unseen.exposures, *state) for kind, state in last.items()}
         expected = expected or {null: torch.ones(unseen.frames.shape)}
         return {kind: Score.of(unseen.left(frames.double())) for kind, frames in expected.items()}
 

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Protocol, Self, runtime_checkable
+from typing import Any, ClassVar, NamedTuple, Protocol, Self, TypeVar, runtime_checkable
 
 import numpy as np
 import torch
 
+from ..backends import Backend
 from ..baselines.material import MaterialEstimate
+from ..checks import require
 from ..fit.pose_refinement import PoseRefinement, with_alignment
-from ..fit.running import Running
+from ..fit.run import Run, Running
 from ..inference import Decision
 from ..learning.start import GuessedMatter
 from ..matter import MaterialPrior, MatterKind
@@ -20,10 +22,11 @@ from ..optics.background import Light, LightOptions
 from ..optics.noise_model import NoiseModel
 from ..optics.retrieval import absorption_alone
 from ..progress import Advance, Progress
-from ..representations import Stored
+from ..representations import KINDS, Stored
 from ..scan import Scan
+from ..tables import with_entries
 from .first_volumes import FirstVolumes
-from .keeper import Keeper, Unseen
+from .keeper import Keeper, Unseen, placed_at, where
 from .window import windows_of
 
 
@@ -176,6 +179,7 @@ class Method(Protocol):
 
     of_series: whether it takes all times of a scan at once; all others take frames of one time
     mixes_kinds: whether states of different kinds of Objects compete for its result
+    any_backend: whether GPUs can compute it, too
     likelier: whether fits are likelier than their starts by noise and prior; frames alone prefer what fits their noise
     two_sided: whether its matter may lie on both sides of its medium
     """
@@ -183,6 +187,7 @@ class Method(Protocol):
     kind: ClassVar[str]
     of_series: ClassVar[bool] = False
     mixes_kinds: ClassVar[bool] = False
+    any_backend: ClassVar[bool] = False
     likelier: ClassVar[bool] = False
     two_sided: ClassVar[bool] = False
 
@@ -198,6 +203,11 @@ class Method(Protocol):
     def with_effort(self, effort: float) -> Self:
         """The same method with `effort` times the steps, at least one; one without steps is the same."""
         return self
+
+    def on_backend(self, backend: Backend) -> Self:
+        """The same method computed by `backend`, its start, too. Errors: `InputError` for one that takes no other."""
+        require(self.any_backend, f"the method {self.kind} runs on the CPU only; leave --backend.")
+        return with_entries(self, {"backend": backend})
 
     def require_files(self) -> None:
         """Read the files that the method names, so that one that is missing or damaged is refused before any work.
@@ -219,20 +229,22 @@ def finished(fit: Running) -> Stored:
     return found.on(fit.backend)
 
 
-def run_quietly(fit: Running, report: Advance) -> Stored:
-    """Run a fit to its end without keeping records; what it ended with. Ctrl-C is passed on."""
+Kind = TypeVar("Kind")
+
+
+def run_quietly(fit: Running, report: Advance, kind: type[Kind]) -> Kind:
+    """Run a fit to its end without keeping records; the object of this kind that it ended with. Ctrl-C is passed on."""
     fit.run(lambda record: report(fit.share))
-    return finished(fit)
+    found = finished(fit)
+    assert isinstance(found, kind)
+    return found
 
 
-class Observer(Protocol):
-    """What looks at the states of a run."""
+class Look(Protocol):
+    """Takes in a state of a run; see `Keeper.look`."""
 
-    def look(self, name: str, found: Stored, oversample: int, fitted: bool = True) -> None:
-        """At the latest one; see `Keeper.look`."""
-
-    def moved(self, train: Scan) -> None:
-        """The training frames are elsewhere from now on."""
+    def __call__(self, name: str, found: Stored, oversample: int, fitted: bool, train: Scan) -> None:
+        """Take in the latest one; train: the training frames where they are then."""
 
 
 def solve_stages(method: Method, task: Task, unseen: Unseen | None = None) -> Stored:
@@ -241,22 +253,69 @@ def solve_stages(method: Method, task: Task, unseen: Unseen | None = None) -> St
     unseen: as of `Keeper`. Ctrl-C is passed on.
     """
     keeper = Keeper(task.scan, method.mixes_kinds, unseen)
-    run_stages(method, task, keeper)
+    run_stages(method, task, keeper.look)
     assert keeper.best is not None
     return keeper.best.object
 
 
-def run_stages(method: Method, task: Task, observer: Observer) -> None:
-    """Run all stages of `method` in memory; Ctrl-C is passed on."""
-    found: Stored | None = None
-    for number, stage in enumerate(method.stages()):
-        before = found
-        found, task = begun(stage, task, before)
-        fit = stage.fit(task.in_windows(), found)
-        if found is not before and (number == 0 or fit is None):
-            observer.look(stage.name if number else "start", found, fit.oversample if fit else 0, fitted=False)
-        if fit is not None:
-            found = run_quietly(fit, task.report(stage.name))
-            task = replace(task.moved(fit.result()), near=False)
-            observer.moved(task.scan)
-            observer.look(stage.name, found, fit.oversample, fitted=not method.likelier)
+class Ended(NamedTuple):
+    """What stages came to. object: of the last one that was begun; task: with the frames where they were found; fit:
+    the last one; complete: whether all stages came to their end."""
+
+    object: Stored | None
+    task: Task
+    fit: Running | None = None
+    complete: bool = True
+
+
+def run_stages(method: Method, task: Task, look: Look, run: Run | None = None) -> Ended:
+    """Run the stages of `method` on the engine `run`, from where an earlier run was cut off in one of them.
+
+    Ctrl-C is passed on, unless the engine ends a fit there.
+    """
+    run = run or Run()
+    stages, saved, more, ended = method.stages(), run.saved, run.state, Ended(None, task)
+    with run.as_written():
+        first = int(saved["stage"]) if saved else 0
+        require(first < len(stages), f"stage must be below {len(stages)}, but it is {first}.")
+    for number in range(first, len(stages)):
+        stage, before, again = stages[number], ended.object, bool(saved) and number == first
+        if again:
+            with run.as_written():
+                start, task = begun_before(task, saved)
+        else:
+            with run.timed("start"):
+                start, task = begun(stage, task, before)
+        fit = stage.fit(task.in_windows(), start)
+        if not again and start is not before and (number == 0 or fit is None):
+            look(stage.name if number else "start", start, fit.oversample if fit else 0, False, task.scan)
+        ended = Ended(start, task, ended.fit)
+        if fit is None:
+            continue
+        own, report = {"stage": number} | state_of(start, task), task.report(stage.name)
+        run.state = lambda own=own: own | more()
+        complete = run.fit(stage.name, fit, lambda record, fit=fit, report=report: report(fit.share))
+        task = replace(task.moved(fit.result()), near=False)
+        found = finished(fit)
+        ended = Ended(found, task, fit, complete)
+        if not complete:
+            break
+        look(stage.name, found, fit.oversample, not method.likelier, task.scan)
+    return ended
+
+
+def state_of(start: Stored, task: Task) -> dict[str, Any]:
+    """What a stage begins with, in a checkpoint."""
+    own = {"start": {"kind": start.kind, "state": start.state()}, "near": task.near}
+    if task.freedom is None:
+        return own
+    return own | {"placed": where(task.scan.exposures), "so_far": torch.from_numpy(task.freedom.so_far)}
+
+
+def begun_before(task: Task, saved: Mapping[str, Any]) -> tuple[Stored, Task]:
+    """What the stage of a checkpoint began with (`state_of`), and the task with its frames where they were then."""
+    if task.freedom is not None:
+        scan = replace(task.scan, exposures=placed_at(task.scan.exposures, saved["placed"]))
+        task = replace(task, scan=scan, freedom=replace(task.freedom, so_far=saved["so_far"].numpy()))
+    start = KINDS[saved["start"]["kind"]].from_state(saved["start"]["state"])
+    return start, replace(task, near=bool(saved.get("near", False)))

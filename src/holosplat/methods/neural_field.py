@@ -17,11 +17,10 @@ from ..checks import at_least, require
 from ..fit.loop import Fit, Plan
 from ..fit.optimiser import Adam, Group, Leaves, Trainable
 from ..fit.problem import Problem
-from ..fit.running import Record
+from ..fit.run import Record
 from ..fit.schedule import Schedule
 from ..fit.terms import Objective
 from ..fit.terms.field import FieldVariation, RetrievedThickness
-from ..fit.terms.frames import SpectralMisfit
 from ..geometry import Grid, Poses, Views
 from ..matter import Matter
 from ..model import Model
@@ -41,14 +40,6 @@ PEAK = 0.995
 """Quantile of the retrieved thickness that counts as its largest value: single pixels may be artefacts."""
 SECOND_STAGE = 1_000_003
 """Added to the seed for the stage through the waves."""
-
-
-def _objective() -> Objective:
-    return Objective(l1=0.0, spectral=1.0, floor=0.1)
-
-
-def _schedule() -> Schedule:
-    return Schedule(steps=250, views_per_step=1, decay=0.05)
 
 
 @dataclass(frozen=True)
@@ -80,9 +71,9 @@ class NeuralFit:
     """Steps between updates of where the field is looked at (0: never)."""
     empty: Weight = 0.1
     """Value up to which nothing is there, in these updates."""
-    objective: Objective = field(default_factory=_objective)
+    objective: Objective = field(default_factory=lambda: Objective(l1=0.0, spectral=1.0, floor=0.1))
     """How frames are compared."""
-    schedule: Schedule = field(default_factory=_schedule)
+    schedule: Schedule = field(default_factory=lambda: Schedule(steps=250, views_per_step=1, decay=0.05))
     """Of the stage through the waves; `seconds` is the limit of both stages together, half of it each."""
     terms: tuple[ExtraTerm, ...] = ()
     """Further terms by name, through the waves."""
@@ -101,6 +92,7 @@ class NeuralFields(Method):
     """A neural field that learns the line integrals of `HolographicTV`, and is then fitted to the frames."""
 
     kind: ClassVar[str] = "neural-field"
+    any_backend: ClassVar[bool] = True
 
     volume: HolographicTV = field(default_factory=HolographicTV)
     fit: NeuralFit = field(default_factory=NeuralFit)
@@ -109,15 +101,9 @@ class NeuralFields(Method):
         """The start, and the field, which learns the start's thickness before its fit."""
         return (HolographicStage(self.volume), NeuralStage(self.fit))
 
-    def on_backend(self, backend: Backend) -> NeuralFields:
-        """The same method computed by `backend`, the start, too."""
-        volume = replace(self.volume, backend=backend)
-        return replace(self, fit=replace(self.fit, backend=backend), volume=volume)
-
     def with_effort(self, effort: float) -> NeuralFields:
         """The same method with `effort` times the steps, at least one."""
-        first, steps = (max(1, round(effort * n)) for n in (self.fit.warmup_steps, self.fit.schedule.steps))
-        schedule = replace(self.fit.schedule, steps=steps)
+        first, schedule = max(1, round(effort * self.fit.warmup_steps)), self.fit.schedule.with_effort(effort)
         return replace(self, fit=replace(self.fit, warmup_steps=first, schedule=schedule))
 
 
@@ -159,9 +145,7 @@ def warmed_up(task: Task, matter: Matter, thickness: Tensor, options: NeuralFit)
     if options.warmup_steps == 0:
         return field
     fit = _warm_up(task.scan, field, (thickness / field.pitch).float(), options, task.seed)
-    found = run_quietly(fit, task.report(WARM_UP))
-    assert isinstance(found, NeuralField)
-    return found
+    return run_quietly(fit, task.report(WARM_UP), NeuralField)
 
 
 def _warm_up(scan: Scan, field: NeuralField, target: Tensor, options: NeuralFit, seed: int) -> Fit:
@@ -173,7 +157,7 @@ def _warm_up(scan: Scan, field: NeuralField, target: Tensor, options: NeuralFit,
     base = ground(scan, field.on(backend), field.matter, options.objective, schedule, backend)
     terms = (
         RetrievedThickness(target.to(generator.device), scan.views, share, generator),
-        FieldVariation(_weight(base.frames.spectral, options), options.probes, generator),
+        FieldVariation(base.in_noise(options.weight, options.noise_weight), options.probes, generator),
     )
     return Fit(_plan(Problem(base.model, terms), schedule, options, generator), seed)
 
@@ -185,15 +169,11 @@ def waves_fit(scan: Scan, field: NeuralField, options: NeuralFit, seed: int = 0,
     drawn = field.on(backend)
     drawn.jitter = generator
     base = ground(scan, drawn, field.matter, options.objective, options.schedule, backend, light=light)
-    weight = _weight(base.frames.spectral, options) / len(base.train)
+    weight = base.in_noise(options.weight, options.noise_weight) / len(base.train)
     variation = FieldVariation(weight, options.probes, generator)
     problem = Problem(base.model, (base.frames, variation, *base.extra(options.terms)))
     plan = _plan(problem, options.schedule, options, generator)
     return Fit(replace(plan, judge=base.judge), seed)
-
-
-def _weight(spectral: SpectralMisfit | None, options: NeuralFit) -> float:
-    return options.weight + options.noise_weight * (0.0 if spectral is None else spectral.noise)
 
 
 def _plan(problem: Problem, schedule: Schedule, options: NeuralFit, generator: torch.Generator) -> Plan:

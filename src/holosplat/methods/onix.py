@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -37,14 +37,6 @@ from .neural_field import visual_hull
 from .volume import binning
 
 
-def _objective() -> Objective:
-    return Objective(l1=0.0, spectral=1.0, floor=0.1)
-
-
-def _schedule() -> Schedule:
-    return Schedule(steps=80, decay=0.1)
-
-
 @dataclass(frozen=True)
 @ranged
 class AlignedFit:
@@ -68,9 +60,9 @@ class AlignedFit:
     """Pixels around that."""
     max_voxels: Natural = 3_000_000
     """Frames are binned for the field rather than having more voxels than this: 144 pixels across."""
-    objective: Objective = field(default_factory=_objective)
+    objective: Objective = field(default_factory=lambda: Objective(l1=0.0, spectral=1.0, floor=0.1))
     """How frames are compared."""
-    schedule: Schedule = field(default_factory=_schedule)
+    schedule: Schedule = field(default_factory=lambda: Schedule(steps=80, decay=0.1))
     """Of the fit; no steps leave what the network guesses."""
     terms: tuple[ExtraTerm, ...] = ()
     """Further terms by name."""
@@ -91,60 +83,47 @@ class AlignedFit:
             return found.size, found.weights
         return self.network, dict(PixelAligned(self.network, seed).named_parameters())
 
-    def require_weights(self, network: str) -> None:
-        """Read the weights of `network` where a file of them is named; errors: those of `read_aligned`."""
-        if self.weights:
-            read_aligned(Path(self.weights), network)
-
-    def with_effort(self, effort: float) -> AlignedFit:
-        """The same with `effort` times the steps, at least one."""
-        return replace(self, schedule=replace(self.schedule, steps=max(1, round(effort * self.schedule.steps))))
-
 
 @dataclass(frozen=True)
-class Onix(Method):
-    """ONIX (Zhang et al. 2023) with waves: a network of δ and β that is the same for all scenes, then fitted to one."""
+class PixelAlignedMethod(Method):
+    """A network that is the same for all scenes, then fitted to one; name: of its stage."""
 
-    kind: ClassVar[str] = "onix"
+    name: ClassVar[str]
 
     fit: AlignedFit = field(default_factory=AlignedFit)
 
     def stages(self) -> Sequence[Stage]:
         """The guess, and its fit."""
-        return (AlignedStage(self.fit, ONIX, "pixel-aligned field through the waves"),)
+        return (AlignedStage(self.fit, self.kind, self.name),)
 
     def require_files(self) -> None:
         """Read the weights, where a file of them is named; errors: those of `read_aligned`."""
-        self.fit.require_weights(ONIX)
+        if self.fit.weights:
+            read_aligned(Path(self.fit.weights), self.kind)
 
-    def with_effort(self, effort: float) -> Onix:
+    def with_effort(self, effort: float) -> Self:
         """The same method with `effort` times the steps, at least one."""
-        return replace(self, fit=self.fit.with_effort(effort))
+        return replace(self, fit=replace(self.fit, schedule=self.fit.schedule.with_effort(effort)))
 
 
 @dataclass(frozen=True)
-class PixelNerf(Method):
+class Onix(PixelAlignedMethod):
+    """ONIX (Zhang et al. 2023) with waves: a network of δ and β that is the same for all scenes, then fitted to one."""
+
+    kind: ClassVar[str] = ONIX
+    name: ClassVar[str] = "pixel-aligned field through the waves"
+
+
+@dataclass(frozen=True)
+class PixelNerf(PixelAlignedMethod):
     """pixelNeRF (Yu et al. 2021) for line integrals of attenuation: as ONIX, but the fit knows no waves.
 
     It is fitted to what absorption alone would show, which phase retrieval makes of each frame by itself; frames in
     contact are that already.
     """
 
-    kind: ClassVar[str] = "pixelnerf"
-
-    fit: AlignedFit = field(default_factory=AlignedFit)
-
-    def stages(self) -> Sequence[Stage]:
-        """The guess, and its fit."""
-        return (AlignedStage(self.fit, PIXELNERF, "pixel-aligned field of line integrals"),)
-
-    def require_files(self) -> None:
-        """Read the weights, where a file of them is named; errors: those of `read_aligned`."""
-        self.fit.require_weights(PIXELNERF)
-
-    def with_effort(self, effort: float) -> PixelNerf:
-        """The same method with `effort` times the steps, at least one."""
-        return replace(self, fit=self.fit.with_effort(effort))
+    kind: ClassVar[str] = PIXELNERF
+    name: ClassVar[str] = "pixel-aligned field of line integrals"
 
 
 @dataclass(frozen=True)
@@ -188,8 +167,7 @@ def aligned_fit(task: Task, start: PixelAlignedField, options: AlignedFit, waves
     known, scan = task.uneven, task.scan.binned(factor)
     light = known and known.part(torch.arange(len(task.scan)), factor)
     base = ground(scan, start, start.matter, options.objective, options.schedule, "cpu", light=light)
-    noise = 0.0 if base.frames.spectral is None else base.frames.spectral.noise
-    weight = (options.weight + options.noise_weight * noise) / len(base.train)
+    weight = base.in_noise(options.weight, options.noise_weight) / len(base.train)
     if waves:
         term: Term = AlignedFrames(base.frames, weight, options.smoothing)
     else:

@@ -34,18 +34,6 @@ SECOND_STAGE = 1_000_003
 """Added to the seed for the stage through the waves."""
 
 
-def _objective() -> Objective:
-    return Objective(l1=0.0, spectral=1.0, floor=0.1)
-
-
-def _schedule() -> Schedule:
-    return Schedule(steps=200, views_per_step=8, decay=0.1)
-
-
-def _start() -> HolographicTV:
-    return HolographicTV(refine=1)
-
-
 @dataclass(frozen=True)
 @ranged
 class PinnFit:
@@ -67,9 +55,9 @@ class PinnFit:
     """What it grows by for every pixel of thickness that the noise of the frames amounts to."""
     smoothing: float = 0.005
     """Differences between voxels below which total variation is a square."""
-    objective: Objective = field(default_factory=_objective)
+    objective: Objective = field(default_factory=lambda: Objective(l1=0.0, spectral=1.0, floor=0.1))
     """How frames are compared."""
-    schedule: Schedule = field(default_factory=_schedule)
+    schedule: Schedule = field(default_factory=lambda: Schedule(steps=200, views_per_step=8, decay=0.1))
     """Of the stage through the waves."""
     terms: tuple[ExtraTerm, ...] = ()
     """Further terms by name, through the waves."""
@@ -89,7 +77,7 @@ class Pinn(Method):
     of_series: ClassVar[bool] = True
     likelier: ClassVar[bool] = True
 
-    volume: HolographicTV = field(default_factory=_start)
+    volume: HolographicTV = field(default_factory=lambda: HolographicTV(refine=1))
     fit: PinnFit = field(default_factory=PinnFit)
 
     def stages(self) -> Sequence[Stage]:
@@ -174,8 +162,7 @@ class Waves(GoesOn):
         base = _ground(task, start, options, schedule)
         generator = torch.Generator().manual_seed(task.seed + SECOND_STAGE)
         times, views = base.train.instants, _views(base)
-        spectral = base.frames.spectral
-        weight = options.weight + options.noise_weight * (0.0 if spectral is None else spectral.noise)
+        weight = base.in_noise(options.weight, options.noise_weight)
         terms: list[Term] = [
             base.frames,
             SpaceTimeVariation(weight / views, options.smoothing, times.tolist(), generator),

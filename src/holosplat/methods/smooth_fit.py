@@ -13,7 +13,7 @@ from torch import Tensor
 from ..backends import device, resolve
 from ..baselines.tomography import plateau
 from ..fit.loop import DivergedError
-from ..fit.running import Record, interrupts_held
+from ..fit.run import Record, interrupts_held
 from ..fit.smooth_volume import ContinuousPrior, Descent, VolumeProblem
 from ..fit.whitened import WhitenedFrames
 from ..geometry import Grid
@@ -123,7 +123,7 @@ class SmoothPlan:
 
 
 class SmoothFit:
-    """A smooth volume in progress, as a run asks of every fit (`fit.running`)."""
+    """A smooth volume in progress, as a run asks of every fit (`fit.run`)."""
 
     aside = 0
     stopped_early = False

@@ -14,6 +14,7 @@ from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from ..backends import Backend, device, resolve
+from ..baselines.beyond import MULTIPLE
 from ..baselines.two_materials import told_apart
 from ..checks import in_range, positive, require
 from ..fit.loop import Fit, Plan
@@ -23,7 +24,7 @@ from ..fit.problem import Problem, Term
 from ..fit.schedule import Schedule
 from ..fit.terms import Objective
 from ..fit.terms.object import Bending, membrane_inverse
-from ..geometry import Grid
+from ..geometry import Grid, Views
 from ..matter import Matter
 from ..optics.background import Light
 from ..optics.noise import noise_share
@@ -32,7 +33,7 @@ from ..ranges import Rate, Weight, ranged
 from ..representations import GaussianCloud, SurfaceMesh, isosurface
 from ..representations.isosurface import adjacency, edge_lengths, neighbour_mean
 from ..scan import Scan
-from .field import field_of
+from .cross_validation import predicted_frames
 from .ground import ExtraTerm, ground
 
 VERTICES = "object.vertices"
@@ -61,14 +62,6 @@ class Extraction:
         in_range("spacing", self.spacing, 0.25, 8.0, unit="pixels")
 
 
-def _objective() -> Objective:
-    return Objective(l1=0.0, rounded=1.0, rounding=3.0, bending=1.0, noise_gain=3.0)
-
-
-def _schedule() -> Schedule:
-    return Schedule(steps=100, decay=0.1)
-
-
 @dataclass(frozen=True)
 @ranged
 class SurfaceFit:
@@ -78,9 +71,11 @@ class SurfaceFit:
     """Length of the first steps [pixels], the same for all vertices."""
     stiffness: Weight = 10.0
     """How far a vertex draws its neighbours along, λ of Nicolet et al. (2021)."""
-    objective: Objective = field(default_factory=_objective)
+    objective: Objective = field(
+        default_factory=lambda: Objective(l1=0.0, rounded=1.0, rounding=3.0, bending=1.0, noise_gain=3.0)
+    )
     """How frames are compared, and what bending costs."""
-    schedule: Schedule = field(default_factory=_schedule)
+    schedule: Schedule = field(default_factory=lambda: Schedule(steps=100, decay=0.1))
     """The loop; waves are sampled one finer than for Gaussians unless it says how, for edges are sharper."""
     terms: tuple[ExtraTerm, ...] = ()
     """Further terms by name."""
@@ -100,8 +95,7 @@ class SurfaceOptions:
 
     def with_effort(self, effort: float) -> Self:
         """The same options with `effort` times the steps, at least one."""
-        schedule = replace(self.fit.schedule, steps=max(1, round(effort * self.fit.schedule.steps)))
-        return replace(self, fit=replace(self.fit, schedule=schedule))
+        return replace(self, fit=replace(self.fit, schedule=self.fit.schedule.with_effort(effort)))
 
 
 def extract_surfaces(cloud: GaussianCloud, scan: Scan, options: Extraction = Extraction()) -> SurfaceMesh:
@@ -231,3 +225,16 @@ def _membrane_on_gpu(start: SurfaceMesh, stiffness: float) -> Callable[[Tensor],
     """The same on the GPU, which does not wait for the CPU."""
     edges = adjacency(start.faces.cpu().numpy(), len(start.vertices))
     return membrane_inverse(edges, stiffness, device(start.backend))
+
+
+def frames_of(found: SurfaceMesh | GaussianCloud, scan: Scan, options: SurfaceFit) -> Tensor:
+    """Frames [V, H, W] of `scan` that `found` predicts, as a fit of surfaces predicts them."""
+    return predicted_frames(scan.exposures, found.on(resolve(options.backend)), oversampling(scan, options))
+
+
+def field_of(cloud: GaussianCloud, views: Views) -> Views:
+    """`views` with the rows above and below that `cloud` fills: a multiple of `MULTIPLE`, to the nearest."""
+    with torch.no_grad():
+        height = cloud.centres[:, 1].double() * cloud.unit_length - float(Grid.of_views(views).centre[1])
+    past = float(height.abs().max()) - 0.5 * views.height if len(cloud) else 0.0
+    return views.taller(MULTIPLE * max(0, round(past / (MULTIPLE * views.finest))))

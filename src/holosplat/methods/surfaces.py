@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import ClassVar
 
-from ..backends import Backend, resolve
 from ..checks import InputError, require
 from ..fit.loop import Fit
 from ..inference import Score, select
@@ -17,12 +16,11 @@ from ..progress import Progress
 from ..representations import GaussianCloud, Stored, SurfaceMesh
 from ..scan import Scan
 from .coarse import CoarseToFine, Way, begun_surfaces, coarse_surfaces, missing_matter, on_pixels, settled
-from .cross_validation import predicted_frames
 from .first_surfaces import first_surfaces, is_noisy, surfaces_of_volume
 from .gaussians import Gaussians, GaussianStage
 from .keeper import BY
 from .method import Method, Near, Stage, Task, quiet, run_quietly
-from .surface_fit import SurfaceOptions, extract_surfaces, oversampling, surface_fit
+from .surface_fit import SurfaceOptions, extract_surfaces, frames_of, surface_fit
 
 STAGE = "surfaces"
 
@@ -46,6 +44,7 @@ class Surfaces(SurfaceOptions, Method):
     """
 
     kind: ClassVar[str] = "surfaces"
+    any_backend: ClassVar[bool] = True
 
     gaussians: Gaussians = field(default_factory=Gaussians)
 
@@ -57,10 +56,6 @@ class Surfaces(SurfaceOptions, Method):
     def require_files(self) -> None:
         """Those of the Gaussians."""
         self.gaussians.require_files()
-
-    def on_backend(self, backend: Backend) -> Surfaces:
-        """The same method computed by `backend`."""
-        return replace(self, gaussians=self.gaussians.on_backend(backend), fit=replace(self.fit, backend=backend))
 
     def with_effort(self, effort: float) -> Surfaces:
         """The same method with `effort` times the steps, at least one."""
@@ -116,9 +111,7 @@ class BodiesStage(GaussianStage):
         return found[decision.choice]
 
     def _score(self, found: SurfaceMesh, task: Task) -> Score:
-        there = found.on(resolve(self.surfaces.fit.backend))
-        predicted = predicted_frames(task.scan.exposures, there, oversampling(task.scan, self.surfaces.fit))
-        return Score.of(task.scan.left(predicted.double()))
+        return Score.of(task.scan.left(frames_of(found, task.scan, self.surfaces.fit).double()))
 
     def _missing(self, found: SurfaceMesh | GaussianCloud, task: Task) -> float:
         return missing_matter(found, task, self.surfaces)
@@ -189,9 +182,7 @@ def refine_surfaces(
         start = stage.start(task, cloud)
     else:
         task = replace(task, near=True)
-    found = run_quietly(stage.fit(task, start), task.report(STAGE))
-    assert isinstance(found, SurfaceMesh)
-    return found
+    return run_quietly(stage.fit(task, start), task.report(STAGE), SurfaceMesh)
 
 
 def _by_coarse_pixels(cloud: Stored, task: Task, stage: SurfaceStage) -> SurfaceMesh | None:

@@ -8,7 +8,6 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ..backends import resolve
 from ..baselines.holographic_tv import agreed
 from ..baselines.two_materials import Shares, at_one_ratio
 from ..checks import InputError, require
@@ -16,10 +15,9 @@ from ..geometry import Grid
 from ..matter import Matter
 from ..representations import SurfaceMesh
 from .coarse import settled
-from .cross_validation import predicted_frames
 from .gaussian_options import GaussianOptions
 from .method import Task
-from .surface_fit import SurfaceOptions, cut_surfaces, oversampling
+from .surface_fit import SurfaceOptions, cut_surfaces, frames_of
 
 LEVELS = (0.2, 0.3, 0.4, 0.5, 0.6)
 """Occupancies at which a volume may be cut."""
@@ -80,6 +78,4 @@ def cut_as_seen(task: Task, volume: Tensor, grid: Grid, matter: Matter, surfaces
 
 def _left(task: Task, found: SurfaceMesh, surfaces: SurfaceOptions) -> float:
     """Mean square of what `found` leaves of the frames."""
-    there = found.on(resolve(surfaces.fit.backend))
-    predicted = predicted_frames(task.scan.exposures, there, oversampling(task.scan, surfaces.fit))
-    return float(task.scan.left(predicted.cpu()).double().square().mean())
+    return float(task.scan.left(frames_of(found, task.scan, surfaces.fit)).double().square().mean())

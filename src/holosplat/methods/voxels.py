@@ -8,7 +8,6 @@ from typing import ClassVar
 
 import torch
 
-from ..backends import Backend
 from ..baselines import HolographicTV, holographic_tv
 from ..baselines.beyond import rows_of
 from ..checks import at_least, require
@@ -40,16 +39,13 @@ class HolographicVoxels(Method):
     """Phase retrieval and total variation, made to agree with the holograms: the start of the Gaussians, by itself."""
 
     kind: ClassVar[str] = "holographic-tv"
+    any_backend: ClassVar[bool] = True
 
     volume: HolographicTV = field(default_factory=HolographicTV)
 
     def stages(self) -> tuple[Stage, ...]:
         """One, without a fit."""
         return (HolographicStage(self.volume),)
-
-    def on_backend(self, backend: Backend) -> HolographicVoxels:
-        """The same method computed by `backend`."""
-        return replace(self, volume=replace(self.volume, backend=backend))
 
 
 @dataclass(frozen=True)
@@ -68,10 +64,6 @@ class HolographicStage:
 
     def fit(self, task: Task, start: Stored) -> None:
         """Nothing is fitted."""
-
-
-def _objective() -> Objective:
-    return Objective(l1=0.0, spectral=1.0, floor=0.1)
 
 
 @dataclass(frozen=True)
@@ -95,7 +87,7 @@ class VoxelFit:
     """Voxels along a pixel's edge (0: as the first fringe needs)."""
     max_voxels: int = 20_000_000
     """Coarser voxels rather than more than this many."""
-    objective: Objective = field(default_factory=_objective)
+    objective: Objective = field(default_factory=lambda: Objective(l1=0.0, spectral=1.0, floor=0.1))
     """How frames are compared."""
     schedule: Schedule = field(default_factory=Schedule)
     """The loop's options but for the number of steps, which is above; all frames are looked at in every step."""
@@ -188,9 +180,7 @@ def voxel_fit(
     refine = max(1, round(scan.views.finest / start.grid.voxel_size[0]))
     schedule = replace(options.schedule, steps=options.steps)
     base = ground(scan, start, start.matter, options.objective, schedule, "cpu", finer=refine, light=light)
-    spectral = base.frames.spectral
-    noise = 0.0 if spectral is None else spectral.noise
-    weight = (options.weight + options.noise_weight * noise) / (refine**2 * len(base.train))
+    weight = base.in_noise(options.weight, options.noise_weight) / (refine**2 * len(base.train))
     scale = torch.tensor([1.0, ABSORPTION_REACH][: len(start.matter)])[:, None, None, None]
     upper = options.upper if options.upper and start.matter.single else float("inf")
 

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 
 from ..bodies.rest_shape import KnownBody, extent_like
-from ..checks import InputError, as_written, require
-from ..fit.running import Record, Steps
+from ..checks import InputError, require
+from ..fit.run import Record, Run
 from ..inference import Decision
 from ..learning.network import Guess
 from ..matter import DeltaBeta
@@ -36,15 +35,12 @@ from .detections import (
 )
 from .elastic import Rest
 from .fit import MotionFit, motion_fit
-from .known import KnownBodies, at_rest
+from .known import KnownBodies, Trials, at_rest, chosen_twins
 from .measures import astray, halves_of, tell_shapes
 from .pieces import chosen_paths
 from .track_linking import first_paths
-from .track_options import Journal, TrackOptions, from_sightings, to_sightings
-from .two_view_ambiguity import Trials, chosen_twins
+from .track_options import TrackOptions
 
-CHECKPOINT_SECONDS = 20.0
-"""What a stage has come to is kept so often [s]."""
 STAGES = ("sightings", "first paths", "stiff", "beside", "paths", "soft", "twins", "soft again", "halves", "done")
 """In about their order: stiff fits and looks beside their bodies take turns."""
 AFTER_SOFT = {"soft": "twins", "soft again": "halves"}
@@ -81,7 +77,7 @@ class BodyTracker:
     options: TrackOptions
     seed: int
     light: Light | None
-    journal: Journal
+    run: Run
     on_progress: FitProgress
     stage: str = "sightings"
     round: int = 0
@@ -89,7 +85,6 @@ class BodyTracker:
     seen: list[list[Detection]] = field(default_factory=list)
     counts: list[int] = field(default_factory=list)
     records: list[Record] = field(default_factory=list)
-    timing: dict[str, float] = field(default_factory=dict)
     halves: list[MovingSurfaces] = field(default_factory=list)
     decisions: list[Decision] = field(default_factory=list)
     oversample: int = 1
@@ -99,49 +94,36 @@ class BodyTracker:
     """Whether a network guesses the volumes of single times, and why."""
     cells: float = 0.0
     """Largest extent [m] of red cells of the volume of those that a network of such guesses; 0 where none does."""
-    _begun: Mapping[str, Any] | None = None
-    """The state of the fit in which the run was cut off."""
     _search: KnownBodies | None = None
-    _kept: float = field(default_factory=time.perf_counter)
-    """When the journal was written."""
 
     def __post_init__(self) -> None:
-        self._steps = Steps(on_step=self._save_now_and_then)
-
-    def take_up(self) -> None:
-        """Go on where the journal ends."""
-        saved = self.journal.load()
-        if saved is not None:
-            with as_written("checkpoint.pt", "a checkpoint of this run"):
+        self.run.state = self._state
+        if saved := self.run.saved:
+            with self.run.as_written():
                 self._take_up(saved)
 
     def _take_up(self, saved: Mapping[str, Any]) -> None:
+        """Go on where an earlier run ended."""
         self.stage, self.round, self.oversample = str(saved["next"]), int(saved["round"]), int(saved["oversample"])
+        require(self.stage in STAGES, f"next must be one of {', '.join(STAGES)}, but it is {self.stage}.")
         self.bodies = None if saved["bodies"] is None else MovingSurfaces.from_state(saved["bodies"])
-        self.seen, self.counts = to_sightings(saved["seen"]), list(saved["counts"])
-        self.records = list(saved["records"])
-        self.timing = {str(name): float(seconds) for name, seconds in saved["timing"].items()}
-        require(self.stage in (*STAGES, "done"), f"next must be one of {', '.join(STAGES)}, but it is {self.stage}.")
+        self.seen = [[Detection.from_state(one) for one in bodies] for bodies in saved["seen"]]
+        self.counts, self.records = list(saved["counts"]), list(saved["records"])
         self.halves = [MovingSurfaces.from_state(one) for one in saved["halves"]]
-        self._begun, self.size, self.guess = saved["fit"], float(saved["size"]), str(saved["guess"])
-        self.cells = float(saved["cells"])
+        self.size, self.guess, self.cells = float(saved["size"]), str(saved["guess"]), float(saved["cells"])
         self.decisions = [Decision.from_dict(one) for one in saved.get("decisions", ())]
-        self._steps = Steps(saved.get("stage_steps", ()), self._save_now_and_then)
 
-    def _save(self, fit: Mapping[str, Any] | None = None) -> None:
-        """Write the journal; fit: the state of the one that runs, which starts at `bodies`."""
-        state = {"next": self.stage, "round": self.round, "oversample": self.oversample, "counts": self.counts}
-        state |= {"size": self.size, "guess": self.guess, "cells": self.cells}
-        state |= {"bodies": None if self.bodies is None else self.bodies.state(), "fit": fit}
-        state |= {"seen": from_sightings(self.seen), "records": self.records, "timing": self.timing}
-        state |= {"decisions": [one.as_dict() for one in self.decisions], "stage_steps": self._steps.done}
-        self.journal.save(state | {"halves": [one.state() for one in self.halves]})
-        self._kept = time.perf_counter()
-
-    def _save_now_and_then(self) -> None:
-        """Write the journal in the midst of a stage of several steps, where it is time."""
-        if time.perf_counter() - self._kept > CHECKPOINT_SECONDS:
-            self._save()
+    def _state(self) -> dict[str, Any]:
+        """What `_take_up` reads; a fit that runs starts at `bodies`."""
+        named = ("round", "oversample", "counts", "size", "guess", "cells", "records")
+        return {
+            "next": self.stage,
+            "bodies": None if self.bodies is None else self.bodies.state(),
+            "seen": [[one.state() for one in bodies] for bodies in self.seen],
+            "decisions": [one.as_dict() for one in self.decisions],
+            "halves": [one.state() for one in self.halves],
+            **{name: getattr(self, name) for name in named},
+        }
 
     def until(self, stage: str) -> None:
         """Go on to the end of all that comes before `stage`, or to where an earlier run came."""
@@ -151,7 +133,7 @@ class BodyTracker:
     def followed(self, said: str = "") -> Followed:
         """The tracked bodies; said: a sentence on their kind."""
         assert self.bodies is not None
-        told = self.records, self.oversample, self.timing, tuple(self.counts), tuple(self.halves)
+        told = self.records, self.oversample, self.run.timing, tuple(self.counts), tuple(self.halves)
         guess, made = self.guess + said, tuple(self.decisions)
         return Followed(self.bodies, *told, self.shape_at_rest(), guess, self.options.body, made)
 
@@ -170,8 +152,7 @@ class BodyTracker:
                 self.counts = [self.bodies.count] * len(self.train.instants)
         elif self.bodies is not None:
             self._go_on(self.bodies)
-        self._steps = Steps(on_step=self._save_now_and_then)
-        self._save()
+        self.run.end_stage()
 
     def _go_on(self, bodies: MovingSurfaces) -> None:
         """The stages after the first paths."""
@@ -211,24 +192,13 @@ class BodyTracker:
         if len(self.halves) == len(parts):
             self.stage = "done"
 
-    @contextmanager
-    def _record_time(self, name: str) -> Iterator[None]:
-        """Of what is done in steps; they are kept where Ctrl-C comes between."""
-        began = time.perf_counter()
-        try:
-            yield
-        except KeyboardInterrupt:
-            self._save()
-            raise
-        self.timing[name] = self.timing.get(name, 0.0) + time.perf_counter() - began
-
     def network(self) -> Guess | None:
         """The network that guesses the volumes of single times, tested at the middle time."""
         if self.options.learned is None:
             return None
         at = self.train.at_instant(len(self.train.instants) // 2)
         how = (self.options.sightings, self.options.learned)
-        with self._record_time("sightings"):
+        with self.run.timed("sightings"):
             found, decision = network_for(at, self.material, *how, lambda stage, part: None)
         self.guess = decision.line
         self.decisions.append(decision)
@@ -241,15 +211,16 @@ class BodyTracker:
         """
         how = replace(self.options.sightings, level=level * self.options.sightings.level)
         times, found = frames.instants, list[list[Detection]]()
-        with self._record_time("sightings"):
+        with self.run.timed("sightings"):
             for t in range(len(times)):
                 self.on_progress("bodies at each time", t / len(times), {})
-                found += to_sightings([self._steps.of(lambda t=t: self._look_at(frames.at_instant(t), how, network))])
+                at = self.run.step("sightings", lambda t=t: self._look_at(frames.at_instant(t), how, network))
+                found.append([Detection.from_state(one) for one in at])
         return found
 
     def _look_at(self, frames: Scan, how: SightingOptions, network: Guess | None) -> list[dict[str, Any]]:
-        """The bodies of one time, as the journal has them."""
-        return from_sightings([sightings(frames, self.material, how, network=network)])[0]
+        """The bodies of one time, as a checkpoint has them."""
+        return [one.state() for one in sightings(frames, self.material, how, network=network)]
 
     def first(self) -> MovingSurfaces:
         """Bodies on first paths; the doubtful ones are left to be found beside the others."""
@@ -297,10 +268,10 @@ class BodyTracker:
         begun: MovingSurfaces | None = None,
     ) -> MovingSurfaces | None:
         """Bodies of known shape beside `known` ones, on first paths; a search may begin with `begun` ones."""
-        with self._record_time("poses"):
+        with self.run.timed("poses"):
             self._search = self._search or KnownBodies(self.train, self.material, body, self.size)
             found = self._search.bodies(
-                basis, known, begun, self.seed, lambda share: self.on_progress("poses", share, {}), self._steps
+                basis, known, begun, self.seed, lambda share: self.on_progress("poses", share, {}), self.run
             )
             self.size = self._search.size
         if begun is not None:
@@ -333,9 +304,9 @@ class BodyTracker:
         """`bodies` of known rest shape, or their twins, where there are two beams."""
         if self.rest is None or not self.options.twins:
             return bodies
-        how = (self.options.stiff, self.options.soft, self.oversample, self.seed, self.light, self._steps)
+        how = (self.options.stiff, self.options.soft, self.oversample, self.seed, self.light, self.run)
         trials = Trials(self.train, self.rest, *how)
-        with self._record_time("twins"):
+        with self.run.timed("twins"):
             found = chosen_twins(bodies, trials, lambda share: self.on_progress("twins", share, {}))
         return self._decided(*found)
 
@@ -343,8 +314,8 @@ class BodyTracker:
         """`bodies` on paths of as many pieces as the frames support."""
         how = (self.options.paths, self.options.stiff, self.seed, self.light, self.rest)
         self.on_progress("paths", 0.0, {})
-        with self._record_time("paths"):
-            found = chosen_paths(self.train, bodies, *how, steps=self._steps)
+        with self.run.timed("paths"):
+            found = chosen_paths(self.train, bodies, *how, run=self.run)
         return self._decided(*found)
 
     def _decided(self, bodies: MovingSurfaces, decision: Decision | None) -> MovingSurfaces:
@@ -357,23 +328,12 @@ class BodyTracker:
     ) -> MovingSurfaces:
         """`start` after a fit to `frames`, from where an earlier run was cut off in it."""
         fit = motion_fit(frames, start, how, self.seed, light, self.rest)
-        if self._begun is not None:
-            fit.load(dict(self._begun))
-            self._begun = None
-        before = len(self.records) - fit.step
 
-        def keep(record: Record) -> None:
-            self.records.append(record | {"step": before + record["step"]})
+        def show(record: Record) -> None:
+            self.records.append(record | {"step": len(self.records) + 1})
             self.on_progress(name, fit.share, record)
-            if time.perf_counter() - self._kept > CHECKPOINT_SECONDS:
-                self._save(fit.state_dict())
 
-        try:
-            fit.run(keep)
-        except KeyboardInterrupt:
-            self._save(fit.state_dict())
-            raise
-        self.timing[name] = self.timing.get(name, 0.0) + fit.seconds
+        self.run.fit(name, fit, show)
         found, self.oversample = fit.result().object, fit.oversample
         assert isinstance(found, MovingSurfaces)
         return found.with_parameters({"coefficients": found.coefficients.detach()})

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,6 +33,16 @@ class Detection:
 
     mesh: TriangleMesh
     cut: bool
+
+    def state(self) -> dict[str, Any]:
+        """Tensors and plain values, for a checkpoint; `from_state` reads them."""
+        arrays = {name: torch.from_numpy(getattr(self.mesh, name)) for name in ("vertices", "faces")}
+        return {**arrays, "name": self.mesh.name, "cut": self.cut}
+
+    @classmethod
+    def from_state(cls, saved: Mapping[str, Any]) -> Detection:
+        """The detection of a `state`."""
+        return cls(TriangleMesh(saved["vertices"].numpy(), saved["faces"].numpy(), saved["name"]), bool(saved["cut"]))
 
     @property
     def volume(self) -> float:

@@ -33,10 +33,6 @@ OPEN = 1e-3
 path takes no steps that are longer than by its inverse."""
 
 
-def _objective() -> Objective:
-    return Objective(l1=0.0, rounded=1.0, rounding=3.0, bending=1.0, noise_gain=3.0)
-
-
 @dataclass(frozen=True)
 @ranged
 class MotionFit:
@@ -58,7 +54,9 @@ class MotionFit:
     """The same of its area: red cells in flow change theirs by 1 to 5 % (0: areas are free)."""
     apart: Weight = 0.2
     """How deep bodies may lie in each other, a standard deviation [pixels] (0: unconstrained)."""
-    objective: Objective = field(default_factory=_objective)
+    objective: Objective = field(
+        default_factory=lambda: Objective(l1=0.0, rounded=1.0, rounding=3.0, bending=1.0, noise_gain=3.0)
+    )
     """How frames are compared, and what bending costs."""
     schedule: Schedule = field(default_factory=lambda: Schedule(steps=100, views_per_step=16))
     """The loop; memory is that of the frames of one step, of which L-BFGS takes several for one of its own."""

@@ -10,17 +10,18 @@ Gaussians stand for it.
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ..baselines.tomography import plateau
-from ..checks import as_written, at_least, positive, require
+from ..checks import at_least, positive, require
 from ..fit.flow_volume import FlowProblem, likelier_fading, likelier_flow
+from ..fit.run import Run
 from ..fit.smooth_volume import descend
 from ..geometry import Grid
 from ..inference import Compared, Decision
@@ -43,12 +44,9 @@ from ..representations import (
 from ..representations.initialise import FILLED
 from ..scan import Scan
 from .timed_frames import Change, Frames, freer_flows, iterations_that_predict, kept_frames, likelihood_ratio, merged
-from .track_options import Journal, Nowhere
 
 MOTION, STILL, FLOW = "motion", "matter at rest", "steady flow"
 FREEDOM, BY = "freedom of the flow", "frames set aside"
-NOWHERE = Nowhere()
-"""No journal."""
 FEWEST_PIXELS = 24
 """Pixels along a frame's shorter side from which on flows are found on voxels of two pixels."""
 
@@ -57,6 +55,8 @@ FEWEST_PIXELS = 24
 @ranged
 class FlowOptions:
     """How matter in motion is reconstructed."""
+
+    kind: ClassVar[str] = "carried"
 
     volume: SmoothVolume = field(default_factory=SmoothVolume)
     """The volume of a time by itself, and of all times as if nothing moved."""
@@ -120,38 +120,52 @@ class _State:
     u: Tensor
     fading: Fading | None = None
 
+    def saved(self) -> dict[str, Any]:
+        """Tensors and plain values, which `of` reads."""
+        fading = {} if self.fading is None else {"fading": self.fading.coefficients}
+        return {"flow": self.flow.state(), "u": self.u, **fading}
+
+    @classmethod
+    def of(cls, saved: Mapping[str, Any], lattice: Lattice) -> _State:
+        """The state that was `saved`; lattice: that of a fading."""
+        fading = Fading(saved["fading"], lattice) if "fading" in saved else None
+        return cls(Flow.from_state(saved["flow"]), saved["u"], fading)
+
 
 class FlowSearch:
-    """The way from frames to matter in motion, step by step; `journal` keeps the last of them."""
+    """The way from frames to matter in motion, in steps of a `run`."""
 
     def __init__(
         self,
         task: Task,
         material: DeltaBeta,
         options: FlowOptions = FlowOptions(),
-        journal: Journal = NOWHERE,
+        run: Run | None = None,
     ) -> None:
-        self.task, self.options, self.journal = task, options, journal
+        self.task, self.options, self.run = task, options, run or Run()
         self.frames = Frames.of(task, material)
         self.times, views = self.frames.times, task.scan.views
         self.middle = len(self.times) // 2
         self.factor = 2 if min(views.shape) >= FEWEST_PIXELS else 1
-        self.prior, self.history, self.timing = options.volume.prior, list[str](), dict[str, float]()
+        self.prior, self.history = options.volume.prior, list[str]()
         self.decisions = list[Decision]()
-        self._strength, self._step, self._saved = 1.0, 0, dict[str, Any]()
+        self._strength = 1.0
         self._extents = ((wide := views.width / views.finest), views.height / views.finest, wide)
+        self.run.state = self._state
+        if saved := self.run.saved:
+            with self.run.as_written():
+                self._take_up(saved)
 
     def by_itself(self, scan: Scan, name: str) -> VoxelGrid:
         """The volume of frames of one time; its prior is taken on."""
-        began = clock.perf_counter()
-        task = prepared(replace(self.task, scan=scan, lit=None, first=None, matter="continuous"))
-        task = replace(task, prior=MaterialPrior.known(self.frames.material))
-        stage = SmoothStage(self.options.volume)
-        fit: SmoothFit = stage.fit(task, stage.start(task, None))
-        fit.run(lambda record: self.task.on_progress(name, fit.share))
+        with self.run.timed(name):
+            task = prepared(replace(self.task, scan=scan, lit=None, first=None, matter="continuous"))
+            task = replace(task, prior=MaterialPrior.known(self.frames.material))
+            stage = SmoothStage(self.options.volume)
+            fit: SmoothFit = stage.fit(task, stage.start(task, None))
+            fit.run(lambda record: self.task.on_progress(name, fit.share))
         self._strength = float(fit.state_dict()["strength"])
         self.prior = self.options.volume.prior.weakened(self._strength)
-        self.timing[name] = clock.perf_counter() - began
         found = fit.result().object
         assert isinstance(found, VoxelGrid)
         return found
@@ -166,15 +180,14 @@ class FlowSearch:
         """Whether a steady flow of matter that is `still` otherwise predicts frames better that it was not fitted to;
         with a change of amplitudes, where that may be. All frames are set aside in turn, a part of them at a time."""
         state = self._still(self.on(still, self.factor))
-
         began, left = clock.perf_counter(), list[tuple[Tensor, Tensor]]()
-        for fold in range(self.options.held_out):
-            self.task.on_progress("does it move", fold / self.options.held_out)
-            keep = self._training_mask(fold)
-            moving = self._update_flow(self._problem_of_all(state, keep), state)
-            left.append((self.left_out(state, ~keep), self.left_out(moving, ~keep)))
-        found = likelihood_ratio(FLOW, *(torch.cat(frames) for frames in zip(*left)))
-        self.timing["does it move"] = clock.perf_counter() - began
+        with self.run.timed("does it move"):
+            for fold in range(self.options.held_out):
+                self.task.on_progress("does it move", fold / self.options.held_out)
+                keep = self._training_mask(fold)
+                moving = self._update_flow(self._problem_of_all(state, keep), state)
+                left.append((self.left_out(state, ~keep), self.left_out(moving, ~keep)))
+            found = likelihood_ratio(FLOW, *(torch.cat(frames) for frames in zip(*left)))
         self._decide(MOTION, STILL, found, began)
         return found.wins
 
@@ -240,51 +253,34 @@ class FlowSearch:
                 return found
             reach *= 2
 
-    def take_up(self) -> None:
-        """Go on where the journal ends."""
-        if (saved := self.journal.load()) is None:
-            return
-        with as_written("checkpoint.pt", "a checkpoint of this run"):
-            self._saved, self.history = {**saved, "steps": int(saved.get("steps", 0))}, list(saved["history"])
-            self._strength = float(saved["strength"])
-            self.decisions = [Decision.from_dict(one) for one in saved.get("decisions", ())]
-            self.timing = {str(name): float(seconds) for name, seconds in saved["timing"].items()}
-            self.prior = self.options.volume.prior.weakened(self._strength)
+    def _take_up(self, saved: Mapping[str, Any]) -> None:
+        """Go on where an earlier run ended; older versions kept the last step beside its number."""
+        self.history, self._strength = list(saved["history"]), float(saved["strength"])
+        self.decisions = [Decision.from_dict(one) for one in saved.get("decisions", ())]
+        self.prior = self.options.volume.prior.weakened(self._strength)
+        if "stage_steps" not in saved and (count := int(saved.get("steps", 0))):
+            self.run.done = [*([None] * (count - 1)), saved]
 
-    def keep(self, state: _State | None = None) -> None:
-        """Write the journal: so many steps are done, and what the last of them found."""
-        found = {} if state is None else {"flow": state.flow.state(), "u": state.u}
-        if state is not None and state.fading is not None:
-            found["fading"] = state.fading.coefficients
-        found |= {"history": list(self.history), "timing": dict(self.timing), "strength": self._strength}
-        found["decisions"] = [one.as_dict() for one in self.decisions]
-        self.journal.save({"steps": self._step, **found})
+    def _state(self) -> dict[str, Any]:
+        """What `_take_up` reads."""
+        decisions = [one.as_dict() for one in self.decisions]
+        own = {"history": list(self.history), "strength": self._strength, "decisions": decisions}
+        return own | {"steps": len(self.run.done)}
 
-    def run(self) -> FlowResult:
+    def solve(self) -> FlowResult:
         """The whole way, from the middle time on."""
-        state = self._run_stage("flow", self._initial_state)
+        state = self._step("flow", self._initial_state)
         windows = self.windows()
         for n, window in enumerate(windows):
             self.task.on_progress("flow", n / (len(windows) + 3))
-            state = self._run_stage("flow", lambda s=state, w=window: self.turns(self._whole(s, w), s))
+            state = self._step("flow", lambda s=state, w=window: self.turns(self._whole(s, w), s))
         return self.finished(self.freer(state))
 
-    def _run_stage(self, name: str, make: Callable[[], _State]) -> _State:
-        """Run `make` and add its time to stage `name`; for finished steps, return the last result."""
-        done, self._step = self._saved.get("steps", 0), self._step + 1
-        if self._step <= done:
-            return self._saved_state()
-        began, before = clock.perf_counter(), sum(self.timing.values())
-        found, others = make(), sum(self.timing.values()) - before
-        self.timing[name] = self.timing.get(name, 0.0) + clock.perf_counter() - began - others
-        self.keep(found)
-        return found
-
-    def _saved_state(self) -> _State:
-        lattice = self.steady(self.options.cells).lattice
-        with as_written("checkpoint.pt", "a checkpoint of this run"):
-            told = Fading(self._saved["fading"], lattice) if "fading" in self._saved else None
-            return _State(Flow.from_state(self._saved["flow"]), self._saved["u"], told)
+    def _step(self, name: str, make: Callable[[], _State]) -> _State:
+        """The state that the next step of the stage `name` makes, or the one that an earlier run has kept."""
+        saved = self.run.step(name, lambda: make().saved(), chain=True)
+        with self.run.as_written():
+            return _State.of(saved, self.steady(self.options.cells).lattice)
 
     def _initial_state(self) -> _State:
         return self._still(self.on(self.first(), self.factor))
@@ -305,8 +301,8 @@ class FlowSearch:
         """The state with as much freedom of the flow in time and space as held-out frames support."""
         count, keep, how = len(self.times), self._training_mask(), self.options
         for change in freer_flows(self._extents, (how.cells, how.most_cells), min(how.most_degree, count - 2)):
-            state = self._run_stage("flow", lambda s=state, c=change: self._try_freer_flow(s, c, keep))
-        return self._run_stage("flow", lambda: self.turns(self._problem_of_all(state), state))
+            state = self._step("flow", lambda s=state, c=change: self._try_freer_flow(s, c, keep))
+        return self._step("flow", lambda: self.turns(self._problem_of_all(state), state))
 
     def _training_mask(self, fold: int = 0) -> np.ndarray:
         """[T, V] bool: the frames that are not held out."""
@@ -333,13 +329,13 @@ class FlowSearch:
 
     def finished(self, state: _State) -> FlowResult:
         """The state on voxels of a pixel, and the Gaussians that stand for it."""
-        state = self._run_stage("volume", lambda: self._fit_fine_voxels(state))
+        state = self._step("volume", lambda: self._fit_fine_voxels(state))
         problem = self.problem(range(len(self.times)), 1, state)
         pixels = problem.count / len(self.times)
         misfit = [2 * one / pixels for one in problem.misfit(state.u)]
         volume = self._volume(state.u, 1)
         found = self.gaussians(volume, state)
-        said = tuple(self.history), self.timing, tuple(self.decisions)
+        said = tuple(self.history), self.run.timing, tuple(self.decisions)
         return FlowResult(found, volume, state.flow, misfit, *said)
 
     def _volume(self, u: Tensor, factor: int) -> VoxelGrid:
@@ -380,12 +376,12 @@ class FlowSearch:
 
     def gaussians(self, volume: VoxelGrid, state: _State) -> MovingGaussians:
         """Gaussians that stand for a volume of the reference time, with its flow and its fading."""
-        began, unit = clock.perf_counter(), self.task.scan.views.finest
+        unit = self.task.scan.views.finest
         spacing, u = self.options.spacing_px * unit, volume.values[0]
         filled = FILLED * plateau(u)
-        first = cloud_from_volume(u, volume.grid, self.frames.material, spacing, unit, filled=filled)
-        found = approximate(first, u, volume.grid, self.options.approximate_steps, self.task.on_progress)
-        self.timing["gaussians"] = clock.perf_counter() - began
+        with self.run.timed("gaussians"):
+            first = cloud_from_volume(u, volume.grid, self.frames.material, spacing, unit, filled=filled)
+            found = approximate(first, u, volume.grid, self.options.approximate_steps, self.task.on_progress)
         cloud, flow, change = found.detached(), state.flow, None
         if state.fading is not None:
             one, two = (self.times[[0, -1]] - flow.reference) / (flow.basis.last - flow.basis.first)

@@ -15,7 +15,7 @@ import torch
 
 from ..bodies.rest_shape import moments
 from ..checks import require
-from ..fit.running import Record
+from ..fit.run import Record
 from ..geometry import Views
 from ..mesh import TriangleMesh
 from ..optics.background import Light

@@ -9,7 +9,7 @@ import torch
 
 from ..checks import at_least, in_range
 from ..fit.residuals import Prediction
-from ..fit.running import Steps
+from ..fit.run import Run
 from ..inference import Compared, Decision, Score
 from ..optics.background import Light
 from ..ranges import ranged
@@ -50,14 +50,14 @@ def chosen_paths(
     light: Light | None = None,
     rest: Rest | None = None,
     *,
-    steps: Steps | None = None,
+    run: Run | None = None,
 ) -> tuple[MovingSurfaces, Decision | None]:
     """`start` on paths of the asked number of pieces, or of the number that predicts held-out frames best; and the
     decision, None where there was none.
 
     The number is doubled as long as a fit predicts the held-out frames better with it than with the number before
-    (`inference.Compared`). A fit has half the steps of `how`. There are never more coefficients than times. steps: in
-    which it is done, one for each fit.
+    (`inference.Compared`). A fit has half the steps of `how`. There are never more coefficients than times. run: whose
+    step each fit is.
     """
     if options.pieces > 0:
         return refined(start, options.pieces), None
@@ -70,9 +70,9 @@ def chosen_paths(
     short = replace(how, schedule=replace(how.schedule, steps=max(1, how.schedule.steps // 2)))
     kept, left = train.with_split(aside), train[np.flatnonzero(aside)]
 
-    steps = steps or Steps()
+    run = run or Run()
 
-    def run(bodies: MovingSurfaces) -> tuple[torch.Tensor, torch.Tensor]:
+    def tried(bodies: MovingSurfaces) -> tuple[torch.Tensor, torch.Tensor]:
         fit = motion_fit(kept, bodies, short, seed, _part(light, ~aside), rest)
         fit.run(lambda record: None)
         found = fit.result().object
@@ -80,7 +80,7 @@ def chosen_paths(
         return found.coefficients.detach(), _left(left, found, fit.oversample)
 
     def fitted(bodies: MovingSurfaces) -> tuple[MovingSurfaces, Score]:
-        coefficients, left = steps.of(lambda: run(bodies))
+        coefficients, left = run.step("paths", lambda: tried(bodies))
         return bodies.with_parameters({"coefficients": coefficients}), Score(left.numpy(), len(left))
 
     best, begun, compared = start.basis.pieces, fitted(start)[0], list[Compared]()

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import torch
 
 from ..bodies.poses import two_beams
 from ..bodies.rest_shape import KnownBody, guessed_cells
-from ..checks import InputError, as_written
+from ..checks import InputError
+from ..fit.run import Journal, Run
 from ..inference import Score, select
 from ..matter import DeltaBeta
 from ..optics.background import Light
@@ -18,26 +17,9 @@ from ..progress import FitProgress
 from ..scan import Scan
 from .body_tracker import BodyTracker, Followed, require_times
 from .detections import predicted
-from .track_options import Journal, Nowhere, TrackOptions
+from .track_options import TrackOptions
 
 NAME, CELLS, ANY = "shape of the bodies", "red cells", "any shape"
-
-
-class NamedJournal:
-    """The journal of one of several runs, by its name."""
-
-    def __init__(self, journal: Journal, states: dict[str, Mapping[str, Any]], name: str) -> None:
-        """states: of all of them, which `journal` keeps together."""
-        self._journal, self._states, self._name = journal, states, name
-
-    def load(self) -> Mapping[str, Any] | None:
-        """Load the last saved state; None at the beginning."""
-        return self._states.get(self._name)
-
-    def save(self, state: Mapping[str, Any]) -> None:
-        """Keep it, beside those of the others."""
-        self._states[self._name] = state
-        self._journal.save(self._states)
 
 
 def compared_kinds(cells: BodyTracker, other: BodyTracker) -> Followed:
@@ -69,11 +51,6 @@ def unexplained(of: BodyTracker) -> Score:
     return Score.of(torch.from_numpy(of.train.frames - predicted(of.train, of.bodies, of.oversample)))
 
 
-__all__ = ["NOWHERE", "USUAL", "Followed", "TrackOptions", "follow", "require_times"]
-
-NOWHERE = Nowhere()
-"""No journal."""
-
 USUAL = TrackOptions()
 """The usual options of `follow`."""
 
@@ -85,7 +62,7 @@ def follow(
     seed: int = 0,
     *,
     light: Light | None = None,
-    journal: Journal = NOWHERE,
+    journal: Journal | None = None,
     on_progress: FitProgress = lambda stage, fraction, record: None,
 ) -> Followed:
     """The bodies of `material` in the training frames of `scan`, of several times.
@@ -98,20 +75,16 @@ def follow(
     """
     train = scan.train()
     require_times(train)
-    with as_written("checkpoint.pt", "a checkpoint of this run"):
-        states = dict[str, Mapping[str, Any]](journal.load() or {})
+    run = Run(journal)
 
-    def following(name: str, body: KnownBody | None) -> BodyTracker:
-        run = BodyTracker(
-            train, material, replace(options, body=body), seed, light, NamedJournal(journal, states, name), on_progress
-        )
-        run.take_up()
-        return run
+    def tracker(name: str, body: KnownBody | None) -> BodyTracker:
+        how = replace(options, body=body)
+        return BodyTracker(train, material, how, seed, light, run.part(name), on_progress)
 
-    run = following("any", options.body)
+    every = tracker("any", options.body)
     if options.body is None and options.cells and two_beams(train.views) is not None:
-        run.until("first paths")
-        if run.cells > 0:
-            return compared_kinds(following("cells", guessed_cells(run.cells)), run)
-    run.until("done")
-    return run.followed()
+        every.until("first paths")
+        if every.cells > 0:
+            return compared_kinds(tracker("cells", guessed_cells(every.cells)), every)
+    every.until("done")
+    return every.followed()

@@ -1,30 +1,18 @@
-"""How bodies are followed through time: the options of `track`, and the journal of a run."""
+"""How bodies are followed through time: the options of `track`."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Protocol
-
-import torch
+from typing import ClassVar
 
 from ..bodies.rest_shape import KnownBody
 from ..fit.schedule import Schedule
 from ..learning.start import LearnedStart
-from ..mesh import TriangleMesh
 from ..ranges import Share, ranged
-from .detections import Detection, SightingOptions
+from .detections import SightingOptions
 from .fit import MotionFit, converged
 from .pieces import PathOptions
 from .track_linking import LinkOptions
-
-
-def _stiff() -> MotionFit:
-    return MotionFit(rate=0.4, stiffness=100.0, schedule=Schedule(steps=60, views_per_step=16))
-
-
-def _half() -> MotionFit:
-    return MotionFit(rate=0.1, schedule=Schedule(steps=40, views_per_step=16))
 
 
 @dataclass(frozen=True)
@@ -52,7 +40,9 @@ class TrackOptions:
     """How often bodies are looked for beside those that are known, at most."""
     fainter: Share = 0.6
     """Factor of the level there: few views smear a body, and beside what is known there is little to take it for."""
-    stiff: MotionFit = field(default_factory=_stiff)
+    stiff: MotionFit = field(
+        default_factory=lambda: MotionFit(rate=0.4, stiffness=100.0, schedule=Schedule(steps=60, views_per_step=16))
+    )
     """The first fit, in which bodies move and turn nearly as a whole."""
     soft: MotionFit = field(default_factory=converged)
     """The second one, in which they deform."""
@@ -61,7 +51,7 @@ class TrackOptions:
     """Whether to compare bodies of known shape with others that have the same shadows in two beams."""
     intervals: bool = True
     """Whether halves of the frames are fitted, too, for standard errors: up to four short fits."""
-    half: MotionFit = field(default_factory=_half)
+    half: MotionFit = field(default_factory=lambda: MotionFit(rate=0.1, schedule=Schedule(steps=40, views_per_step=16)))
     """The fit to a half, from the result: errors are hundredths of a pixel. By Adam: halves that L-BFGS fits to the end
     agree on what both have from a known shape (two beams at 24°: volumes off by five standard errors). Where few beams
     see bodies of unknown shape, halves begin apart and are fitted as all frames are, softly: short fits leave them so
@@ -70,57 +60,5 @@ class TrackOptions:
     def with_effort(self, effort: float) -> TrackOptions:
         """The same with `effort` times the steps, at least one."""
         parts = {name: getattr(self, name) for name in ("stiff", "soft", "half")}
-        changed = {
-            name: replace(part, schedule=replace(part.schedule, steps=max(1, round(effort * part.schedule.steps))))
-            for name, part in parts.items()
-        }
+        changed = {name: replace(part, schedule=part.schedule.with_effort(effort)) for name, part in parts.items()}
         return replace(self, **changed)
-
-
-class Journal(Protocol):
-    """Keeps the last state of a run: tensors, and plain values."""
-
-    def load(self) -> Mapping[str, Any] | None:
-        """Load the last saved state; None at the beginning."""
-        ...
-
-    def save(self, state: Mapping[str, Any]) -> None:
-        """Keep `state` in place of what was saved before."""
-        ...
-
-
-class Nowhere:
-    """Keeps nothing."""
-
-    def load(self) -> None:
-        """Load nothing."""
-
-    def save(self, state: Mapping[str, Any]) -> None:
-        """Forget it."""
-
-
-def from_sightings(found: Sequence[Sequence[Detection]]) -> list[list[dict[str, Any]]]:
-    """Sightings at each time as tensors and plain values, which `to_sightings` reads."""
-    return [
-        [
-            {
-                "vertices": torch.from_numpy(one.mesh.vertices),
-                "faces": torch.from_numpy(one.mesh.faces),
-                "name": one.mesh.name,
-                "cut": one.cut,
-            }
-            for one in bodies
-        ]
-        for bodies in found
-    ]
-
-
-def to_sightings(saved: Sequence[Sequence[Mapping[str, Any]]]) -> list[list[Detection]]:
-    """The inverse of `from_sightings`."""
-    return [
-        [
-            Detection(TriangleMesh(one["vertices"].numpy(), one["faces"].numpy(), one["name"]), bool(one["cut"]))
-            for one in bodies
-        ]
-        for bodies in saved
-    ]

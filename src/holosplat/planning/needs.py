@@ -27,8 +27,8 @@ from ..methods import (
     Surfaces,
     Voxels,
 )
-from ..methods.coarse_cloud import MOST_GAUSSIANS
 from ..methods.first_volumes import FEWEST, MANY, MOST, WIDTH
+from ..methods.start import MOST_GAUSSIANS
 from ..optics.sampling import fringe_sampling, padding
 from ..scan import Exposures
 from ..units import two_digits

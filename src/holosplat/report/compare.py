@@ -21,8 +21,8 @@ from ..scan import Scan
 from ..tables import to_table
 from ..units import in_percent, wavenumber
 from ..volume import Volume
-from ..workflows.binding import CONFIG_SUM, RUN
 from ..workflows.evaluate import Evaluation, evaluate, of_absorption
+from ..workflows.provenance import CONFIG_SUM, RUN
 from ..workflows.reconstruct import load_reconstruction
 from ..workflows.reconstruction import Reconstruction, instants_of, reconstruction_at
 from ..workflows.run_folder import RunFolder

@@ -14,7 +14,7 @@ from ..io.atomic import write_rows
 from ..tables import number_in
 from .folder import Body, Row, SeriesFolder, TaskState, plain, time_left
 from .plan import Moment, SeriesPlan
-from .time import PHASE
+from .task import PHASE
 
 if TYPE_CHECKING:
     from .page import SeriesPage

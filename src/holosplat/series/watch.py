@@ -27,8 +27,7 @@ from ..scan import Scan
 from ..workflows.run_folder import RunFolder
 from .folder import ROW, Row, plain, read_row, write_row
 from .plan import Settings, at, times_of
-from .task import attempted
-from .time import PHASE, Before, Shot, reconstruct_time
+from .task import PHASE, Before, Shot, attempted, reconstruct_time
 
 FORMAT = "holosplat watch 1"
 MARKER, SCAN, SCANS = "watch.json", "scan.json", "scans"

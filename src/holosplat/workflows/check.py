@@ -8,7 +8,7 @@ import h5py
 
 from ..checks import InputError, require
 from ..io.hdf5 import open_hdf5
-from .manifest import MANIFEST, faults
+from .provenance import MANIFEST, faults
 from .run_folder import RunFolder
 
 ROWS = 64

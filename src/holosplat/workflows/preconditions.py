@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from numbers import Real
 from typing import Any
 
 import numpy as np
-import torch
 
 from ..checks import as_written, require
 from ..inference import Decision
@@ -20,8 +18,8 @@ from ..methods.presets import SCHEMA
 from ..methods.uncertain import Uncertain
 from ..optics.background import LightOptions
 from ..scan import Scan
-from ..tables import shown, to_table
-from .binding import RESUMED_WITH
+from ..tables import to_table
+from .provenance import RESUMED_WITH
 from .run_folder import OBJECT_SUM, RunFolder
 
 
@@ -72,19 +70,6 @@ def _require_same(folder: RunFolder, old: dict[str, Any], same: dict[str, Any]) 
         )
 
 
-def require_alike(saved: Any, own: Any, name: str = "") -> None:
-    """`InputError` where a saved state has a value of another kind than a fit's `own` at its beginning: a text for a
-    number, or a number for a table. What one of them lacks is left to the fit, as are lists."""
-    if saved is None or own is None:
-        return
-    kinds = (Mapping, torch.Tensor, str, Real)
-    kind = next((kind for kind in kinds if isinstance(own, kind)), object)
-    require(isinstance(saved, kind), f"{name or 'the state'} must be like {shown(own)}, but it is {shown(saved)}.")
-    if isinstance(own, Mapping):
-        for key in own.keys() & saved.keys():
-            require_alike(saved[key], own[key], str(key))
-
-
 def _without_backends(table: Any) -> None:
     if isinstance(table, dict):
         table.pop("backend", None)
@@ -100,12 +85,10 @@ def decisions_of(task: Task) -> dict[str, Any]:
     return {"light": list(taken), "decisions": made}
 
 
-def decided_before(folder: RunFolder) -> Prepared:
-    """What a run that goes on has decided of sign, light and noise; `InputError` for a folder that does not say it."""
-    with as_written(folder.config, "of a run that has begun"):
-        table = folder.read_config()["decided"]
-        made = tuple(Decision.from_dict(each) for each in table["decisions"])
-        return tuple(str(each) for each in table["light"]), made
+def decided_before(decided: Mapping[str, Any]) -> Prepared:
+    """The decisions on sign, light and noise of a run that goes on, by the entry `decided` of its config.json."""
+    made = tuple(Decision.from_dict(each) for each in decided["decisions"])
+    return tuple(str(each) for each in decided["light"]), made
 
 
 FEWEST_COLUMNS = 11

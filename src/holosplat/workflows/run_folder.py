@@ -5,9 +5,8 @@ from __future__ import annotations
 import csv
 import secrets
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,8 +20,7 @@ from ..io.json import read_json, write_json
 from ..io.lock import sole_writer
 from ..io.provenance import sha256
 from ..ranges import require_plausible
-from .binding import CONFIG_SUM, RUN, config_sum, require_bound
-from .manifest import write_manifest
+from .provenance import CONFIG_SUM, RUN, config_sum, require_bound, write_manifest
 
 if TYPE_CHECKING:
     from ..representations import Stored
@@ -221,21 +219,6 @@ class RunFolder:
             return state
         require(not damaged, f"{self.checkpoint} must be a checkpoint, but it is damaged; start anew without it.")
         return None
-
-
-@dataclass(frozen=True)
-class Checkpoint:
-    """Keeps the state of a run as checkpoint.pt of its folder: a `motion.track_options.Journal`."""
-
-    folder: RunFolder
-
-    def load(self) -> Mapping[str, Any] | None:
-        """What was saved last; None at the beginning."""
-        return self.folder.load_checkpoint()
-
-    def save(self, state: Mapping[str, Any]) -> None:
-        """Keep `state` in place of what was saved before."""
-        self.folder.save_checkpoint(dict(state))
 
 
 @contextmanager

@@ -1,14 +1,17 @@
-"""`track`: the scan of several times in, closed bodies in motion and their run folder out."""
+"""A scan of several times in, matter in motion and its run folder out: closed bodies (`track`), or Gaussians that a
+flow carries (`reconstruct_moving`)."""
 
 from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
 from ..checks import as_written, require
 from ..fit.residuals import Prediction
+from ..fit.run import Run
 from ..io.atomic import atomic_folder, write_rows
 from ..io.pvd import TimeStep, write_pvd
 from ..io.vtk import write_mesh
@@ -16,19 +19,22 @@ from ..matter import KnownSeveral, MaterialPrior
 from ..methods import Task
 from ..methods.assumed import assumed_material
 from ..methods.illumination import prepared
+from ..motion.body_tracker import Followed, require_times
 from ..motion.elastic import Rest, strain_energy
+from ..motion.flow_reconstruction import FlowOptions, FlowResult, FlowSearch, merged
 from ..motion.measures import columns, measured, row, standard_errors
-from ..motion.track import NOWHERE, USUAL, Followed, TrackOptions, follow, require_times
+from ..motion.track import USUAL, follow
+from ..motion.track_options import TrackOptions
 from ..optics.background import LightOptions
+from ..optics.sampling import fringe_sampling
 from ..progress import FitProgress
-from ..representations import MovingSurfaces
+from ..representations import InMotion, MovingSurfaces, VoxelGrid
 from ..scan import Scan
-from ..tables import read_rows, to_table
-from .choice import Choice
+from ..tables import read_rows
 from .preconditions import check_frames, goes_on
 from .provenance import environment
-from .reconstruction import Assumptions, Reconstruction, config_of, write_rest, write_run
-from .run_folder import Checkpoint, RunFolder, claimed
+from .reconstruction import Choice, Reconstruction, config_of, write_rest, write_run
+from .run_folder import RunFolder, claimed
 from .run_illumination import light_options_of
 from .verdict import judge
 
@@ -38,6 +44,8 @@ STRAIN = "strain_energy_J"
 """The column of energies beside the shape at rest."""
 ERROR = "se_"
 """How the names of columns with standard errors begin."""
+USUAL_FLOW = FlowOptions()
+"""How matter in motion is reconstructed by default."""
 
 
 def track(
@@ -90,34 +98,41 @@ def track(
     require_times(scan.train())
     check_frames(scan.train())
     assumed = light or LightOptions()
-    method = {"kind": options.kind, **to_table(options)}
-    config = config_of(scan, prior, method, seed, "levels", Assumptions(assumed))
+    config = config_of(scan, prior, options, seed, "levels", assumed)
     with claimed(folder):
         if folder is not None and not goes_on(folder, config, resume):
             folder.begin(config | environment("cpu"))
         task = prepared(Task(scan.train(), prior, seed, lambda stage, part: on_progress(stage, part, {}), assumed))
         train = task.scan
         material = assumed_material(train.at_instant(0), task.prior, task.on_progress)
-        journal = NOWHERE if folder is None else Checkpoint(folder)
-        found = follow(train, material, options, seed, light=task.uneven, journal=journal, on_progress=on_progress)
-        said = Prediction(found.bodies, train.exposures, found.oversample)
-        done = Reconstruction(
-            found.bodies,
-            options.kind,
-            train.exposures.reference_energy,
-            found.oversample,
-            found.timing,
-            True,
-            Choice("levels", {}, "soft fit", found.begun, (*task.decisions, *found.decisions)),
-            task.delta_told,
-            judge(said, train, task.noise if task.uneven else None),
-            light=light_options_of(task),
-            rest=_rest(found),
-        )
+        found = follow(train, material, options, seed, light=task.uneven, journal=folder, on_progress=on_progress)
+        choice = Choice("levels", {}, "soft fit", found.begun, (*task.decisions, *found.decisions))
+        done = _in_motion(found, found.bodies, task, choice, found.oversample)
         if folder is not None:
             _write(folder, done, found, task)
             write_tracks(folder, found.bodies, scan, _more(found, scan))
         return done
+
+
+def _in_motion(
+    found: FlowResult | Followed, obj: InMotion, task: Task, choice: Choice, oversample: int
+) -> Reconstruction:
+    """The matter in motion that was `found`, with the verdict on all times."""
+    exposures, noise = task.scan.exposures, task.noise if task.uneven else None
+    kind = TrackOptions.kind if isinstance(found, Followed) else FlowOptions.kind
+    return Reconstruction(
+        obj,
+        kind,
+        exposures.reference_energy,
+        oversample,
+        found.timing,
+        True,
+        choice,
+        task.delta_told,
+        judge(Prediction(obj, exposures, oversample), task.scan, noise),
+        light=light_options_of(task),
+        rest=_rest(found) if isinstance(found, Followed) else None,
+    )
 
 
 def _rest(found: Followed) -> Rest | None:
@@ -174,3 +189,72 @@ def write_tracks(
                 write_mesh(temporary / name, mesh, LENGTH_UNIT)
             steps.append(TimeStep(float(time), tuple(folder.path / BODIES / name for name, _ in named)))
     write_pvd(folder.path / COLLECTION, steps)
+
+
+@dataclass(frozen=True)
+class FlowReconstruction:
+    """The result for moving matter. reconstruction: `object.at(t)` is the matter at any time [s]; volume: at the flow's
+    reference time, on voxels; history: the decisions on the way, in words."""
+
+    reconstruction: Reconstruction
+    volume: VoxelGrid
+    history: tuple[str, ...]
+
+
+def reconstruct_moving(
+    scan: Scan,
+    prior: MaterialPrior,
+    options: FlowOptions = USUAL_FLOW,
+    seed: int = 0,
+    *,
+    light: LightOptions | None = None,
+    ask: bool = True,
+    folder: RunFolder | None = None,
+    resume: bool = False,
+    on_progress: FitProgress = lambda stage, fraction, record: None,
+) -> FlowReconstruction | None:
+    """Continuous matter that moves through the training frames of `scan`, of several times; None where nothing moves.
+
+    `reconstruction.object` of the result is a `MovingGaussians`. ask: whether to test for motion first; without, matter
+    is taken to move. light: what is assumed of it (default: even, unless air says otherwise). A material that is
+    not known is estimated from the mean of all times. With a `folder`, everything is written there, unless nothing
+    moves, and every step is kept; a later call with `resume=True` goes on from the last one, with the same result, bit
+    for bit, as if nothing had happened. Errors: `InputError` for a scan of one or two times, frames that are not
+    relative to the flat field, two materials, and folders that do not fit.
+    """
+    require(
+        not isinstance(prior, KnownSeveral), "a flow carries one material, but several are known; give --material once."
+    )
+    train = scan.train()
+    count = len(train.instants)
+    require(
+        count >= 3,
+        f"matter in motion needs training frames of three times or more, but theirs are of {count}; choose a time.",
+    )
+    check_frames(train)
+    assumed = light or LightOptions()
+    config = config_of(scan, prior, options, seed, "continuous", assumed)
+    going = goes_on(folder, config, resume)
+    task = prepared(Task(train, prior, seed, lambda stage, part: on_progress(stage, part, {}), assumed))
+    mean = merged(task.scan)
+    material = assumed_material(mean, task.prior, task.on_progress)
+    search = FlowSearch(task, material, options, Run(folder))
+    if not going and ask and not search.moves(search.by_itself(mean, "mean of all times")):
+        return None
+    if folder is not None and not going:
+        folder.begin(config | environment("cpu"))
+        search.run.keep()
+    found = search.solve()
+    decisions, against = (*task.decisions, *found.decisions), task.prior.against
+    choice = Choice("continuous", {}, "Gaussians", decisions=decisions, against=against)
+    done = _in_motion(found, found.object, task, choice, fringe_sampling(train.exposures))
+    if folder is not None:
+        folder.start_metrics([])
+        seen = {"times_s": task.scan.instants.tolist(), "misfit": found.misfit, "asked": list(found.history)}
+        write_run(folder, done, task, None, seen)
+    return FlowReconstruction(done, found.volume, found.history)
+
+
+def begun_in_motion(folder: RunFolder) -> bool:
+    """Whether a folder holds a run of matter in motion, finished or not."""
+    return folder.config.is_file() and folder.read_config().get("method", {}).get("kind") == FlowOptions.kind

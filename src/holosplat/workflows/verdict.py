@@ -14,7 +14,7 @@ from ..align import find_axis
 from ..checks import InputError
 from ..fit.misfit_diagnosis import Cause, cause_scores, likely_causes
 from ..fit.residuals import Prediction, Residuals, residuals, split_validation
-from ..fit.running import Running
+from ..fit.run import Running
 from ..methods import Task
 from ..model import LightField, Model, SolvedLight
 from ..optics.noise import noise_levels
