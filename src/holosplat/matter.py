@@ -161,9 +161,9 @@ class MaterialPrior:
 
         >>> import holosplat as hs
         >>> hs.MaterialPrior.known(hs.DeltaBeta(5.8e-7, 2.6e-10))
-        Known(material=DeltaBeta(delta=5.8e-07, beta=2.6e-10), medium='')
+        Known(material=DeltaBeta(delta=5.8e-07, beta=2.6e-10), medium='', two_sided=False)
         >>> hs.MaterialPrior.of_ratio(2200)
-        KnownRatio(ratio=2200.0, sign=0)
+        KnownRatio(ratio=2200.0, sign=0, two_sided=False)
         >>> hs.MaterialPrior.unknown().fixes_ratio
         False
     """

@@ -27,7 +27,7 @@ from holosplat.optics.retrieval import paganin
 from holosplat.representations import VoxelGrid
 from holosplat.scan import Exposures, Scan
 from holosplat.workflows.evaluate import held_out_verdict
-from holosplat.workflows.next_step import STEPS, next_step
+from holosplat.workflows.next_step import STEPS, STIFF, next_step
 from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
 from holosplat.workflows.run_folder import RunFolder
 from holosplat.workflows.verdict import Verdict, judge, judge_run, verdict
@@ -137,6 +137,15 @@ def test_a_model_that_follows_the_noise_is_said():
     said = verdict(residuals(Prediction(soft(), scan.exposures, 2), torch.from_numpy(half.frames), power))
     assert said.good
     assert "below the noise (0.5" in said.reasons[0]
+
+
+def test_a_volume_has_no_levels_to_give_up(monkeypatch):
+    """The next command would be the one that was given."""
+    scan = a_scan(soft(), 100_000)
+    stiff = replace(on(scan, soft(0.2)), cause=STIFF)
+    monkeypatch.setattr("holosplat.workflows.verdict.verdict", lambda left: stiff)
+    assert next_step(STIFF) is not None
+    assert on(scan, soft(0.2)).cause == ""
 
 
 def test_verdicts_survive_json_and_damage_is_refused():

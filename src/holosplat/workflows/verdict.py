@@ -19,7 +19,7 @@ from ..methods import Task
 from ..model import LightField, Model, SolvedLight
 from ..optics.noise import noise_levels
 from ..optics.noise_model import NoiseModel
-from ..representations import Stored
+from ..representations import Stored, VoxelGrid
 from ..scan import Scan
 from ..units import in_percent, plain, two_digits
 from .next_step import STIFF, next_step
@@ -128,6 +128,8 @@ def judge(said: Prediction, frames: Scan, noise: NoiseModel | None = None) -> Ve
     measured = torch.from_numpy(frames.frames)
     left = residuals(said, measured, (noise or _noise(frames.measured)).power(), missing=frames.gaps)
     found = verdict(left)
+    if found.cause == STIFF and isinstance(said.object, VoxelGrid):  # it has neither levels nor sharp edges to give up
+        found = replace(found, cause="")
     absorbing, refracting = _matter(said)
     if not bool(absorbing.any() or refracting.any()):
         return replace(found, good=False, words=NOTHING, reasons=(HELP, *found.reasons)) if found.good else found
