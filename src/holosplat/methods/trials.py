@@ -178,11 +178,7 @@ def with_more(light: Light, hypothesis: str, seen: Scan, predict: Predict, optio
     for air may be matter."""
     frames = seen.measured
     if hypothesis == "fixed pattern":
-        if len(seen) < 2:
-            return None
-        even = light.evened(frames)
-        first = replace(light, still=fixed_pattern(even, predict(light)))
-        return replace(light, still=fixed_pattern(even, predict(first)))  # the volume before it took a part for matter
+        return replace(light, still=fixed_pattern(light.evened(frames), predict(light))) if len(seen) > 1 else None
     if hypothesis == "correlated noise":
         return replace(light, noise=NoiseModel.of_residuals(light.evened(frames), predict(light)))
     if hypothesis == FLUX:

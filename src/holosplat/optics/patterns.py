@@ -46,14 +46,14 @@ def fixed_pattern(frames: Tensor, predicted: Tensor) -> Tensor:
     frames give the power of the former, and a Wiener filter of single pixels takes their mean for it as far as chance
     allows: `p = mean · c / (c + o / V + e)`, c the pattern's power and o that of a frame alone. A pattern knows nothing
     of matter, and errors of the volume grow with its shadows, of which those of matter near the axis are alike in all
-    frames: e is the part of the common power that goes with the square of what is predicted.
+    frames: e is the part of the common power that goes with the square of the shadow that all have in common.
     """
     shadows = _logarithms(predicted)
     left, count = _logarithms(frames) - shadows, len(frames)
     left = left - left.nanmean()
     total, mean = float(left.square().nanmean()), left.nanmean(dim=0).nan_to_num()
     chance = (total - float(mean.square().mean())) / max(count - 1, 1)  # of the mean: the power of a frame alone over V
-    shadow = shadows.square().mean(dim=0)
+    shadow = shadows.mean(dim=0).square()
     even, with_shadows = _powers(mean.square().numpy(), shadow.numpy())
     common = max(even - chance, 0.0)
     if count < 2 or common == 0:
