@@ -19,8 +19,8 @@ from holosplat.methods import GaussianRates, SmoothVolume, solve
 from holosplat.methods.keeper import Keeper
 from holosplat.methods.method import Task
 from holosplat.representations import GaussianCloud, VoxelGrid
+from holosplat.workflows.choice import Choice
 from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
-from holosplat.workflows.reconstruction import Choice
 from holosplat.workflows.run_folder import RunFolder
 
 pytestmark = pytest.mark.usefixtures("unjudged_runs")

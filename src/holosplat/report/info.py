@@ -13,7 +13,7 @@ from ..io.json import read_json
 from ..io.reading import Reading
 from ..memory import uncollected
 from ..units import in_percent
-from ..workflows.reconstruction import Choice
+from ..workflows.choice import Choice
 from ..workflows.run_folder import RunFolder
 
 if TYPE_CHECKING:

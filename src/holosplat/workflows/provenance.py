@@ -8,18 +8,18 @@ import os
 import platform
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
-from ..backends import device_name
 from ..checks import InputError, require
 from ..io.json import read_json, write_json
 from ..io.leftovers import files_in
 from ..io.provenance import sha256
-from ..scan import Exposures, Scan
 from ..version import __version__
+
+if TYPE_CHECKING:  # the command line names files of runs before it loads PyTorch
+    from ..scan import Exposures, Scan
 
 
 def scan_hash(scan: Scan) -> str:
@@ -52,6 +52,10 @@ def _energies(exposures: Exposures) -> float | list[float]:
 
 def environment(backend: str) -> dict[str, dict[str, str]]:
     """Versions and machine, for config.json; `backend` is the one that fits."""
+    import torch
+
+    from ..backends import device_name
+
     return {
         "versions": {
             "holosplat": __version__,

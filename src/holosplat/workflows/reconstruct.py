@@ -27,6 +27,7 @@ from ..optics.sampling import fringe_sampling
 from ..progress import FitProgress, FitState
 from ..ranges import require_plausible
 from ..scan import Scan
+from .choice import Choice
 from .preconditions import (
     check_frames,
     decided_before,
@@ -36,7 +37,7 @@ from .preconditions import (
     require_one_time,
 )
 from .provenance import environment, scan_hash
-from .reconstruction import Choice, Reconstruction, config_of, read_rest, write_run
+from .reconstruction import Reconstruction, config_of, read_rest, write_run
 from .refine import (
     freedom_of,
     keep_geometry,

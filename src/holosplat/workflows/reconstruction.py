@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -16,7 +16,6 @@ from ..checks import as_written, require
 from ..display import card, of_object
 from ..fit.run import Running
 from ..geometry import Grid
-from ..inference import Decision
 from ..io.json import read_json
 from ..io.light import write_light
 from ..io.objects import write_object
@@ -32,70 +31,12 @@ from ..optics.background import LightOptions
 from ..representations import InMotion, MovingSurfaces, Stored
 from ..scan import Scan
 from ..tables import to_table
+from .choice import Choice
 from .provenance import scan_hash
 from .run_folder import RunFolder
 from .run_illumination import EVEN
 from .totals import TotalMatter
 from .verdict import Verdict
-
-if TYPE_CHECKING:
-    from ..methods import Task
-
-
-GAUGE = (
-    "against {}: δ and β are differences, zero where it is alone; a constant phase is in no frame, and even absorption "
-    "of what fills the field counts as light"
-)
-"""The note on matter in a medium."""
-
-
-@dataclass(frozen=True)
-class Choice:
-    """What was decided in a run.
-
-    matter: of which kind it was taken to be; judged: share of all matter that each state leaves unexplained in the
-    training frames, by its name; kept: the name of the state that is the result, empty where the run was interrupted;
-    begun: what it began with and why, in a sentence, where a network was asked; decisions: between hypotheses; against:
-    the medium that δ and β are differences to, empty for vacuum
-    """
-
-    matter: MatterKind = "levels"
-    judged: Mapping[str, float] = field(default_factory=dict)
-    kept: str = ""
-    begun: str = ""
-    decisions: tuple[Decision, ...] = ()
-    against: str = ""
-
-    @classmethod
-    def of(cls, task: Task, judged: Mapping[str, float], kept: str, decisions: tuple[Decision, ...]) -> Choice:
-        """What was decided of a `task`."""
-        return cls(task.matter, judged, kept, decisions=decisions, against=task.prior.against)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Entries of summary.json; `read` reads them."""
-        told = {"begun": self.begun, "against": self.against}
-        decided = {"matter": self.matter} | {name: said for name, said in told.items() if said}
-        decisions = [each.as_dict() for each in self.decisions]
-        return {"decided": decided, "decisions": decisions, "kept": self.kept, "unexplained": dict(self.judged)}
-
-    @classmethod
-    def read(cls, summary: Mapping[str, Any]) -> Choice:
-        """What a summary.json says of it; that of older versions says nothing."""
-        decided = summary.get("decided", {})
-        matter: MatterKind = "continuous" if decided.get("matter") == "continuous" else "levels"
-        decisions = tuple(Decision.from_dict(each) for each in summary.get("decisions", ()))
-        kept, begun = str(summary.get("kept", "")), str(decided.get("begun", ""))
-        against = str(decided.get("against", ""))
-        return cls(matter, summary.get("unexplained", {}), kept, begun, decisions, against)
-
-    def lines(self) -> list[str]:
-        """The same as a few lines of text."""
-        lines = [each.line for each in self.decisions]
-        lines += [GAUGE.format(self.against)] if self.against else []
-        lines += [f"start: {self.begun}"] if self.begun else []
-        if len(self.judged) > 1 and self.kept and self.kept != next((d.choice for d in self.decisions[-1:]), ""):
-            lines.append(f"result: {self.kept}")
-        return lines
 
 
 def summary_of(done: Reconstruction, fit: Running | None, train: Scan) -> dict[str, Any]:

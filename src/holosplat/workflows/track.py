@@ -31,9 +31,10 @@ from ..progress import FitProgress
 from ..representations import InMotion, MovingSurfaces, VoxelGrid
 from ..scan import Scan
 from ..tables import read_rows
+from .choice import Choice
 from .preconditions import check_frames, goes_on
 from .provenance import environment
-from .reconstruction import Choice, Reconstruction, config_of, write_rest, write_run
+from .reconstruction import Reconstruction, config_of, write_rest, write_run
 from .run_folder import RunFolder, claimed
 from .run_illumination import light_options_of
 from .verdict import judge
