@@ -137,7 +137,7 @@ def _told(made: Scene, light: str, matter: MatterKind) -> hs.workflows.Reconstru
     """
     before = (() if light == NULL else tuple(light.split(" and ")), ())
     place = importlib.import_module("holosplat.workflows.reconstruct")
-    with patch.object(place, "prepared", lambda task, method, _: prepared(task, method, before)):
+    with patch.object(place, "prepared", lambda task, method, *_: prepared(task, method, before)):
         return hs.reconstruct(made.scan, made.prior, METHOD, matter=matter)
 
 

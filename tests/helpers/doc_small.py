@@ -96,6 +96,8 @@ class Small:
 
 
 FAST = {"reconstruct": "--preset fast"}
+BOTH_SIDES = """$(case "$*" in *both*) echo --method volume ;; *) echo --preset fast ;; esac)"""
+"""Gaussians lie on one side of their medium."""
 PAGES: dict[str, Small] = {
     "README.md": Small(f"{SCAN} my_scan.h5", FAST),
     "alignment.md": Small(
@@ -116,7 +118,7 @@ PAGES: dict[str, Small] = {
             holosplat simulate --specimen $kind --pixel-size 2e-6 {SCENE} --detector 20 20 --out $kind.nxs \\
                 --truth $kind.h5
         done""",
-        FAST,
+        {"reconstruct": BOTH_SIDES},
         without="fibres",
     ),
     "imaging_chain.md": Small(f"for n in 0 1 2; do {SCAN} beam$n.nxs; done"),

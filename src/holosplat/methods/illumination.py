@@ -112,10 +112,17 @@ def prepared(task: Task, method: Method | None = None, before: Prepared | None =
 
     Frames that were divided by light before stay as they are: what that left open (`Scan.light`) is then what is not
     known of it. A pattern that is an unknown of the `method` itself is not looked for. Of several times the middle one
-    decides for all. Errors: those of `Light.of`.
+    decides for all. Errors: those of `Light.of`, and `InputError` for matter on both sides of its medium, where the
+    method has none.
     """
     if task.lit is not None:
         return task
+    if method is not None:
+        require(
+            method.two_sided or not task.prior.two_sided,
+            f"matter on both sides of its medium is continuous, but the method is {method.kind}; take --method auto or "
+            "volume.",
+        )
     first = first_of_task(task, _volume_of(method).backend)
     if before is None:
         first, signs = decide_sign(first, *_scores(task.light))

@@ -76,11 +76,6 @@ def settled(
         not (matter == "continuous" and isinstance(task.prior, KnownSeveral)),
         "--matter must be levels or auto where several materials are known, but it is continuous; give one --material.",
     )
-    require(
-        method.two_sided or not task.prior.two_sided,
-        f"matter on both sides of its medium is continuous, but the method is {method.kind}; take --method auto or "
-        "volume.",
-    )
     if isinstance(method, Gaussians):
         resolve(method.fit.backend)  # before the decision, which takes its time
     constants = determine(task, uncertain or Uncertain())
