@@ -115,7 +115,7 @@ PAGES: dict[str, Small] = {
     "howto/unknown_material.md": Small(f"{SCAN} scan.nxs"),
     "howto/which_matter.md": Small(
         f"""for kind in {KINDS}; do
-            holosplat simulate --specimen $kind --pixel-size 2e-6 {SCENE} --detector 20 20 --out $kind.nxs \\
+            holosplat simulate --specimen $kind --pixel-size 2e-6 {SCENE} --detector 24 24 --out $kind.nxs \\
                 --truth $kind.h5
         done""",
         {"reconstruct": BOTH_SIDES},
