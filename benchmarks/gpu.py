@@ -192,7 +192,7 @@ def others(side: int, edge: int, device: str, time: Callable[[Callable[[], Any],
     rest = [torch.ones_like(u) for _ in range(4)]
     found["step of total variation"] = (
         1e3 * time(lambda: steps.ascend(u, q, 0.5, 0.1), repeats),
-        1e3 * time(lambda: steps.descend(rest[0], rest[1], q, 1.0, 1.0, rest[2], rest[3]), repeats),
+        1e3 * time(lambda: steps.descend(rest[0], rest[1], q, 1.0, (0.0, 1.0), rest[2], rest[3]), repeats),
     )
     return found
 

@@ -217,9 +217,9 @@ class MaterialPrior:
     def on_both_sides(self) -> MaterialPrior:
         """The same knowledge of continuous matter on both sides of its medium. Errors: `InputError` for several
         materials."""
-        raise InputError(
-            "matter on both sides of its medium must be of one --material, but there are several; give one."
-        )
+        one = len(self.materials) < 2
+        require(one, "matter on both sides of its medium must be of one --material, but there are several; give one.")
+        return replace(self, two_sided=True)  # type: ignore[type-var]  # every kind is a dataclass
 
     def with_ratio(self, ratio: float) -> MaterialPrior:
         """What is known of one material whose δ/β was found."""
@@ -278,10 +278,6 @@ class Known(MaterialPrior):
     def sign(self) -> Sign:  # type: ignore[override]
         """That of the material's δ."""
         return -1 if self.material.delta < 0 else 1
-
-    def on_both_sides(self) -> MaterialPrior:
-        """The same of matter on both sides."""
-        return replace(self, two_sided=True)
 
 
 @dataclass(frozen=True)
@@ -342,10 +338,6 @@ class KnownRatio(MaterialPrior):
         """The same with that sign."""
         return replace(self, sign=sign)
 
-    def on_both_sides(self) -> MaterialPrior:
-        """The same of matter on both sides."""
-        return replace(self, two_sided=True)
-
 
 @dataclass(frozen=True)
 class Unknown(MaterialPrior):
@@ -363,10 +355,6 @@ class Unknown(MaterialPrior):
     def signed(self, sign: Sign) -> MaterialPrior:
         """The same with that sign."""
         return replace(self, sign=sign)
-
-    def on_both_sides(self) -> MaterialPrior:
-        """The same of matter on both sides."""
-        return replace(self, two_sided=True)
 
 
 def _require_contrast(material: DeltaBeta) -> None:

@@ -16,6 +16,7 @@ from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import METHODS, SmoothVolume, Task
 from holosplat.methods.contrast import ABOVE, BOTH, STAGE, decide_sides
+from holosplat.methods.illumination import prepared
 from holosplat.methods.trials import first_of_task
 from holosplat.optics.background import LightOptions
 from holosplat.optics.retrieval import Tikhonov, tikhonov
@@ -99,6 +100,16 @@ def test_both_sides_are_taken_where_they_predict_unseen_frames(scan):
     assert decision.choice == BOTH
     assert found.prior.two_sided
     assert found.prior.sign == -1
+
+
+def test_a_run_that_goes_on_keeps_both_sides(scan):
+    task = prepared(Task(scan, MaterialPrior.of_ratio(WATER.ratio)), SmoothVolume())
+    assert task.prior.two_sided
+    assert task.first is not None
+    again = prepared(
+        Task(scan, MaterialPrior.of_ratio(WATER.ratio)), SmoothVolume(), (tuple(task.first.taken), task.decisions)
+    )
+    assert (again.prior, again.decisions) == (task.prior, task.decisions)
 
 
 def test_bodies_of_one_side_stay_there(bodies):
