@@ -88,6 +88,7 @@ def test_the_smooth_volume_finds_both_sides(scan, pair):
     assert np.linalg.norm(found - truth.delta) < 0.2 * np.linalg.norm(truth.delta)
     assert found.min() < 0.8 * truth.delta.min()
     assert found.max() > 0.8 * truth.delta.max()
+    assert done.choice.kept == "smooth volume"  # and not the start, which has both sides as well
     assert done.total is not None
     assert done.total.value is None
     assert "on both sides no error is known" in done.total.words
