@@ -96,6 +96,30 @@ def test_what_wins_in_one_fold_must_win_over_all():
     assert ("other", 2) not in asked  # it had lost by then
 
 
+def test_what_one_fold_leaves_open_all_of_them_decide():
+    """Two frames of which one alone is halved tell nothing; eight, seven of which are halved, do."""
+    uneven = torch.tensor([0.5, 1.05])[:, None, None]
+
+    def score(name, fold):
+        factor = 1.0 if name == "null" else uneven if fold == 0 else 0.5
+        return Score.of(factor * noise((2, 32, 32), fold))
+
+    assert select("name", ["null", "other"], score, 1, by="views").choice == "null"
+    assert select("name", ["null", "other"], score, 4, by="views").choice == "other"
+
+
+def test_a_candidate_that_cannot_win_is_not_followed():
+    """A residual of .995 times the null's in every block is less than the margin, whatever other folds say."""
+    asked = []
+
+    def score(name, fold):
+        asked.append((name, fold))
+        return residuals({"null": (1.0, 1.0), "other": (0.995, 0.5)})(name, fold)
+
+    assert select("name", ["null", "other"], score, 2, by="views set aside").choice == "null"
+    assert ("other", 1) not in asked
+
+
 def test_a_gain_that_another_score_has_shown_needs_practical_size_only():
     unsure = torch.tensor([0.4, 1.2])[:, None, None]
 

@@ -16,7 +16,8 @@ from holosplat.inference import Score
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import Auto, SmoothVolume, Task
 from holosplat.methods.first_volumes import BY_FISSION, BY_VIEWS, FirstVolumes, Folds
-from holosplat.methods.illumination import SHOWN, STAGE, prepared, shows_matter
+from holosplat.methods.illumination import STAGE, prepared, shows_matter
+from holosplat.methods.levels import SHOWN
 from holosplat.methods.trials import UNEVEN, WITHOUT, Trials, first_of_task, plain_light, with_more
 from holosplat.optics.background import FLUX, Background, Light, LightOptions
 from holosplat.scan import Exposures, Scan

@@ -14,12 +14,12 @@ from helpers.runs import KNOWN, SMALL
 from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError, NoMatterError
 from holosplat.geometry import Grid, Views
-from holosplat.inference import Score
+from holosplat.inference import Decision, Score
 from holosplat.matter import DeltaBeta, MaterialPrior, Matter
 from holosplat.methods import Auto, Gaussians, Method, Task, settled
 from holosplat.methods.cross_validation import MissingMatter
-from holosplat.methods.levels import CONTINUOUS, LEVELS, TrialFits, decide_matter, flattened
-from holosplat.methods.trials import first_of_task, plain_light
+from holosplat.methods.levels import CONTINUOUS, LEVELS, SHOWN, TrialFits, decide_matter, flattened
+from holosplat.methods.trials import WITHOUT, first_of_task, plain_light
 from holosplat.methods.uncertain import Determined
 from holosplat.optics.background import LightOptions
 from holosplat.representations import Stored, VoxelGrid
@@ -125,6 +125,17 @@ def test_fits_alone_overturn_a_known_material(soft):
     for levels, continuous, choice in ((near, near, "one level"), (far, near, CONTINUOUS), (near, far, "one level")):
         found = decide_matter(task, {"levels": levels, "continuous": continuous})
         assert (found.choice, found.by) == (choice, "views set aside, by fits")
+
+
+def test_first_volumes_that_show_no_matter_do_not_decide_its_kind(soft):
+    """Of this soft cell they are sure; where unseen frames speak against them, fits are asked, and find one level."""
+    grid = Grid.of_views(soft.views)
+    near, far = (Answer(VoxelGrid(torch.full((1, *grid.shape), x), grid, Matter.one(*MATERIAL))) for x in (0.0, 1.0))
+    methods = {"levels": near, "continuous": far}
+    assert decide_matter(Task(soft, RATIO), methods).choice == CONTINUOUS
+    hidden = Decision(SHOWN, "as measured" + WITHOUT, "views set aside")
+    found = decide_matter(Task(soft, RATIO, decisions=(hidden,)), methods)
+    assert (found.choice, found.by) == ("one level", "views set aside, by fits")
 
 
 def test_fits_must_win_in_every_fold(soft, monkeypatch):

@@ -39,6 +39,11 @@ class Compared:
         return self.gain < -self._sure
 
     @property
+    def open(self) -> bool:
+        """Whether the gain may yet be of practical size, as far as its error tells."""
+        return self.gain + ERRORS * self.error > LEAST
+
+    @property
     def large(self) -> bool:
         """Whether the gain is of practical size, sure or not."""
         return self.gain > LEAST
@@ -98,10 +103,11 @@ def select(
     """The candidate that predicts unseen frames best, by the policy of `Compared.wins`.
 
     candidates: the null first, then from simple to complex; score: of a candidate on the unseen frames of a fold, kept
-    by the caller; folds: how many there are. Folds are looked at one after another, as long as the candidate wins; it
-    is taken only if it wins over all of them, where the frames, and not their blocks, give the standard error: frames
-    differ by more than their parts do. by: how unseen frames came about; beside: other names that a candidate must win
-    against, too. surely: whether a gain must be sure; where another score has told that, its size is enough.
+    by the caller; folds: how many there are. Folds are looked at one after another, as long as the candidate may win by
+    those before; it is taken only if it wins over all of them, where the frames, and not their blocks, give the
+    standard error: frames differ by more than their parts do. by: how unseen frames came about; beside: other names
+    that a candidate must win against, too. surely: whether a gain must be sure; where another score has told that, its
+    size is enough.
     """
     require(len(candidates) > 0, "a selection needs at least one candidate, but there is none.")
     began, best, compared = time.perf_counter(), candidates[0], list[Compared]()
@@ -109,7 +115,7 @@ def select(
         rivals = (best, *(beside or {}).get(candidate, ()))
         found = _least(candidate, rivals, score, range(1))
         for last in range(1, folds):
-            if found.wins:
+            if found.open:
                 found = _least(candidate, rivals, score, range(last + 1))
         compared.append(found)
         if found.wins or (found.large and not surely):

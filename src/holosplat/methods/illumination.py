@@ -28,13 +28,12 @@ from .contrast import STAGE as SIGN
 from .contrast import Scoring, decide_sides, decide_sign, with_sign
 from .cross_validation import predicted_frames
 from .first_volumes import BY_FISSION, EFFORT, FirstVolumes
-from .levels import TrialFits
+from .levels import SHOWN, TrialFits, blind
 from .method import Method, Task
 from .trials import UNEVEN, WITHOUT, Hypothesis, Trials, first_of_task, name_of, named, plain_light, rivals, with_more
 from .volume import SmoothVolume
 
 STAGE = "light and noise"
-SHOWN = "matter in first volumes"
 HYPOTHESES = ("fixed pattern", FLUX, UNEVEN, "correlated noise")
 """What may be added to the null, in this order where several predict alike."""
 
@@ -153,7 +152,7 @@ def prepared(task: Task, method: Method | None = None, before: Prepared | None =
             if task.prior.two_sided:
                 first.taken, made = decided(first, options, told, tuple(open_to))
         shown = None if method is None or method.of_series or not made else shows_matter(first, options, first.taken)
-        if isinstance(method, Auto) and shown is not None and shown.choice.endswith(WITHOUT):
+        if isinstance(method, Auto) and shown is not None and blind([shown]):
             kinds = method.with_effort(EFFORT).kinds
             alone: dict[MatterKind, Method] = {"continuous": kinds["continuous"]}
             scored = by_fits(task, first, alone if task.prior.two_sided else kinds)

@@ -8,7 +8,7 @@ kind are fitted to the coarse frames.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -23,10 +23,11 @@ from ..matter import MatterKind
 from ..representations import VoxelGrid
 from .first_volumes import BY_FISSION, FirstVolumes, predictions
 from .method import Method, Task, solve_stages
-from .trials import Trial, Trials, accepted, first_of_task, hypothesis_of, name_of
+from .trials import WITHOUT, Trial, Trials, accepted, first_of_task, hypothesis_of, name_of
 from .uncertain import Determined, likeliest_ratio
 
 STAGE = "levels or continuous matter"
+SHOWN = "matter in first volumes"
 NAME = "matter"
 LEVELS = ("one level", "two levels")
 SEVERAL = "several levels"
@@ -38,8 +39,8 @@ def decide_matter(task: Task, methods: Mapping[MatterKind, Method] | None = None
 
     A known material has one level, two have two: that is the null, which flat volumes may keep, but fits of `methods`
     for either kind alone overturn. Where less is known and there are such methods, the null is continuous matter, which
-    bounds nothing; where flat volumes predict neither better nor worse, these are fitted. One ratio δ/β holds one
-    level. Of views that are too few to set some aside, levels are taken.
+    bounds nothing; where flat volumes predict neither better nor worse, or first volumes show no matter, these are
+    fitted. One ratio δ/β holds one level. Of views that are too few to set some aside, levels are taken.
     """
     if task.prior.two_sided:
         return Decision(NAME, CONTINUOUS, "matter lies on both sides of its medium")
@@ -55,10 +56,11 @@ def decide_matter(task: Task, methods: Mapping[MatterKind, Method] | None = None
         return Decision(NAME, LEVELS[0], "nothing in a first volume lies more than a pixel inside matter")
     known = methods is None or bool(task.prior.materials)
     candidates = (*levels, CONTINUOUS) if known else (CONTINUOUS, *levels)
-    found = select(NAME, candidates, flat.score, first.folds.count, by=first.folds.by)
-    sure = found.choice != CONTINUOUS or (not known and all(each.loses for each in found.compared))
-    if methods is None or sure:
-        return found
+    if methods is None or not blind(task.decisions):
+        found = select(NAME, candidates, flat.score, first.folds.count, by=first.folds.by)
+        sure = found.choice != CONTINUOUS or (not known and all(each.loses for each in found.compared))
+        if methods is None or sure:
+            return found
     fits = TrialFits(task, first, methods)
 
     def scored(name: str, fold: int) -> Score:
@@ -140,6 +142,11 @@ class TrialFits:
 def ratio_of_one(task: Task, first: FirstVolumes) -> Determined:
     """δ/β where nothing is known and all matter has one: `likeliest_ratio`, found once for a task."""
     return first.once("likeliest ratio", 0, lambda: likeliest_ratio(task))
+
+
+def blind(decisions: Iterable[Decision]) -> bool:
+    """Whether it was decided that first volumes predict unseen frames no better than no matter would."""
+    return any(each.name == SHOWN and each.choice.endswith(WITHOUT) for each in decisions)
 
 
 def kind_of(choice: str) -> MatterKind:

@@ -13,7 +13,8 @@ from ..inference import Decision
 from ..io.provenance import sha256
 from ..methods import Task
 from ..methods.contrast import STAGE as SIGN
-from ..methods.illumination import SHOWN, STAGE, Prepared
+from ..methods.illumination import STAGE, Prepared
+from ..methods.levels import SHOWN
 from ..methods.presets import SCHEMA
 from ..methods.uncertain import Uncertain
 from ..optics.background import LightOptions
