@@ -70,9 +70,9 @@ def decided(
 
 
 def shows_matter(first: FirstVolumes, options: LightOptions, taken: Hypothesis) -> Decision:
-    """Whether the first volumes under a hypothesis predict unseen frames better than no matter would."""
+    """Whether the first volumes under a hypothesis predict unseen frames better than no matter would, surely or not."""
     trials, name = Trials(first, options), name_of(taken)
-    return select(SHOWN, (name + WITHOUT, name), trials.score, first.folds.count, by=first.folds.by)
+    return select(SHOWN, (name + WITHOUT, name), trials.score, first.folds.count, by=first.folds.by, surely=False)
 
 
 def by_fits(task: Task, first: FirstVolumes, kinds: Mapping[MatterKind, Method]) -> Scored:
