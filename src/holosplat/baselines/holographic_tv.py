@@ -140,10 +140,9 @@ def retrieved(
     """Thickness [V, H, W] of `material` [m], which phase retrieval finds in every view by itself; leaves: whether
     matter goes on above and below the frames."""
     backend, noise = resolve(options.backend), correlated(light)
-    how = Tikhonov(
-        iterations=options.retrieval, backend=backend, leaves=leaves, noise=noise, two_sided=options.two_sided
-    )
+    how = Tikhonov(iterations=options.retrieval, backend=backend, leaves=leaves, noise=noise)
     known = {"options": how, "missing": scan.gaps, "on_progress": partial(on_progress, "phase retrieval")}
+    known["two_sided"] = options.two_sided
     return tikhonov(torch.from_numpy(scan.frames), scan.exposures, *material, **known)
 
 

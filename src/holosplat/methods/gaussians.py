@@ -57,6 +57,7 @@ class Gaussians(GaussianOptions, Method):
 
     kind: ClassVar[str] = "gaussians"
     any_backend: ClassVar[bool] = True
+    two_sided: ClassVar[bool] = True
 
     def stages(self) -> tuple[Stage, ...]:
         """One: the start, and the fit."""

@@ -62,8 +62,6 @@ class Regularised:
     """Whether matter goes on above and below the frames (`bounded_estimate`)."""
     prior: Prior | None = None
     """Expected power of the phase (default: the one that the frames show)."""
-    two_sided: bool = False
-    """Whether phases may be negative, of matter on both sides of its medium."""
 
     def __post_init__(self) -> None:
         at_least(self, 1, "iterations")
@@ -99,7 +97,7 @@ class WaveModel:
     ) -> None:
         told = {"missing": missing, "two_sided": two_sided}
         estimate = bounded_estimate(frames, exposures, ratio, noise, leaves, prior, sign, **told)
-        self.sign, self._least = sign, -math.inf if two_sided else 0.0
+        self.sign, self.least = sign, -math.inf if two_sided else 0.0
         energy = exposures.one_energy("the wave model of a phase retrieval")
         self.exposures, self.ratio = exposures, float(absorption(exposures, ratio)[0])
         self.backend = resolve("reference" if frames.dtype == torch.float64 else backend)
@@ -145,7 +143,7 @@ class WaveModel:
 
     def bounded(self, phase: Tensor, support: Tensor | None = None) -> Tensor:
         """The phase where it may be (positive, unless matter is two-sided, and inside the support), zero elsewhere."""
-        return phase.clamp_min(self._least) * (self.support if support is None else support)
+        return phase.clamp_min(self.least) * (self.support if support is None else support)
 
     def thickness(self, phase: Tensor, delta: float) -> Tensor:
         """Means over the frame's pixels [V, h, w], in metres."""
