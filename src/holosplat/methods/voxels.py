@@ -9,7 +9,7 @@ from typing import ClassVar
 import torch
 
 from ..baselines import HolographicTV, holographic_tv
-from ..baselines.beyond import rows_of
+from ..baselines.beyond import margins_of
 from ..checks import at_least, require
 from ..fit.loop import Fit, Plan
 from ..fit.optimiser import Leaves
@@ -155,7 +155,7 @@ class VoxelStage:
         free = before.matter.single and not task.prior.fixes_ratio
         refine = 1 if self.coarse else refinement(task.scan, self.options)
         grid = (before.freed() if free else before).resampled(
-            Grid.of_views(task.scan.views.taller(rows_of(before.grid, task.scan.views)), refine)
+            Grid.of_views(task.scan.views.padded(margins_of(before.grid, task.scan.views)), refine)
         )
         return grid.with_parameters({"values": grid.values.detach().float()})
 

@@ -18,7 +18,7 @@ from ...scan import Exposures
 from ...units import wavelength
 from ..hologram import hologram, optical_path
 from ..sampling import alike, fringe_sampling, padding
-from .bounded import FIXED, MODEL_ERROR, Estimate, bounded_estimate
+from .bounded import FIXED, MODEL_ERROR, NOWHERE, Estimate, Leaves, bounded_estimate
 from .spectra import (
     Gaps,
     Noise,
@@ -58,8 +58,8 @@ class Regularised:
     """Standard deviation of the frames, or their noise model (default: estimated from them)."""
     backend: str = "cpu"
     """Implementation of the wave optics (see `backends`)."""
-    leaves: bool = False
-    """Whether matter goes on above and below the frames (`bounded_estimate`)."""
+    leaves: Leaves = NOWHERE
+    """Whether matter goes on above and below the frames, and at their sides (`bounded_estimate`)."""
     prior: Prior | None = None
     """Expected power of the phase (default: the one that the frames show)."""
 
@@ -88,7 +88,7 @@ class WaveModel:
         ratio: float,
         noise: Noise,
         backend: str = "cpu",
-        leaves: bool = False,
+        leaves: Leaves = NOWHERE,
         prior: Prior | None = None,
         *,
         sign: float = 1.0,
@@ -118,7 +118,7 @@ class WaveModel:
             (exposures.views.shape, (my, mx), self.oversample),
             frames.dtype,
         ).to(self.frames.device)
-        h, prior = response(exposures, ratio, self.raster), prior or (FIXED if leaves else None)
+        h, prior = response(exposures, ratio, self.raster), prior or (FIXED if any(leaves) else None)
         self.spectra = spectra(frames, exposures, h, self.raster, noise, MODEL_ERROR, prior, missing=missing)
         self.strongest = column(sensitivity(exposures, ratio) ** 2)
         self.support, self.phase = self._spread(estimate)
