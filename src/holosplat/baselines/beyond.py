@@ -20,8 +20,8 @@ from ..optics.sampling import fringe_reach, fringe_sampling
 from ..scan import Scan
 
 OUTER, LEAVING, FINE = 2, 0.15, 0.1
-"""Rows at the top and at the bottom, or columns at the sides, the part of the mean occupancy from which on matter goes
-on there, and the part of the mean square slope along them. Uneven light may pass for matter, without fine structure."""
+"""Rows at the top and at the bottom, the part of the mean occupancy from which on matter goes on there, and the part of
+the mean square slope along a row of the frames: uneven light may pass for matter, but has no fine structure."""
 SURE = 4.0
 """Standard deviations of chance by which noise may have this fine structure there."""
 ROOM = 2
@@ -39,35 +39,26 @@ def rows_beyond(volume: Tensor, scan: Scan, ratio: float) -> int:
     the outermost rows of the frames have no fine structure, and where frames of a material of β/δ = `ratio` show
     absorption alone, which is seen where it is. Else the fringes' reach with the blur, and `ROOM`.
     """
-    exposures = scan.exposures
-    if not _goes_on(volume.abs().mean(dim=(0, 2)), scan, 1) or absorption_alone(exposures, ratio).all():
+    exposures, frames = scan.exposures, torch.from_numpy(scan.frames).double()
+    noise = 2 * float(noise_levels(scan.measured).square().mean())
+    slopes = frames.diff(dim=2).square().mean(dim=(0, 2)) - noise
+    chance = noise * math.sqrt(3 / (OUTER * len(frames) * frames.shape[2]))  # 3: neighbouring slopes share a pixel
+    for rows, part, doubt in ((volume.abs().mean(dim=(0, 2)), LEAVING, 0.0), (slopes, FINE, SURE * chance)):
+        outer = max(float(rows[:OUTER].mean()), float(rows[-OUTER:].mean()))
+        if outer <= part * float(rows.mean()) + doubt:
+            return 0
+    if absorption_alone(exposures, ratio).all():
         return 0
     return MULTIPLE * math.ceil((fringe_reach(exposures, fringe_sampling(exposures)) + ROOM) / MULTIPLE)
 
 
-def columns_beyond(lines: Tensor, scan: Scan, share: float) -> int:
-    """Columns on either side of the frames of `scan` in which a volume must have matter of its own; 0 where none.
+def columns_beyond(views: Views, share: float) -> int:
+    """Columns on either side of the frames of `views` in which a volume has matter: this `share` of them.
 
-    lines: line integrals [V, H, W] of a first volume; share: how many, as a share of the frame's. Matter that leaves
-    the frames sideways lies on the rays of other views. A volume that ends with the frames takes it for matter inside,
-    however little of it the frames show. So this is asked of frames of absorption, too.
+    Matter that leaves the frames sideways lies on the rays of other views. A volume that ends with the frames takes it
+    for matter inside.
     """
-    if share == 0 or not _goes_on(lines.abs().mean(dim=(0, 1)), scan, 2):
-        return 0
-    return MULTIPLE * math.ceil(share * scan.views.shape[1] / MULTIPLE)
-
-
-def _goes_on(matter: Tensor, scan: Scan, axis: int) -> bool:
-    """Whether the outermost rows (`axis` 1) or columns (2) have matter, of which each has so much, that frames show."""
-    frames, along = torch.from_numpy(scan.frames).double(), 3 - axis
-    noise = 2 * float(noise_levels(scan.measured).square().mean())
-    slopes = frames.diff(dim=along).square().mean(dim=(0, along)) - noise
-    chance = noise * math.sqrt(3 / (OUTER * len(frames) * frames.shape[along]))  # 3: neighbouring slopes share a pixel
-    for each, part, doubt in ((matter, LEAVING, 0.0), (slopes, FINE, SURE * chance)):
-        outer = max(float(each[:OUTER].mean()), float(each[-OUTER:].mean()))
-        if outer <= part * float(each.mean()) + doubt:
-            return False
-    return True
+    return MULTIPLE * math.ceil(share * views.shape[1] / MULTIPLE)
 
 
 def carried_on(images: Tensor, rows: int, columns: int = 0) -> Tensor:

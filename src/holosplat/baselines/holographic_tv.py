@@ -97,8 +97,8 @@ class HolographicTV:
     """Whether a volume without a bound has rows of its own above and below the frames where matter goes on there; else
     it goes on as in its outermost ones."""
     beside: Weight = 0.0
-    """Width of what is unknown at either side of the frames, where matter leaves them there (interior tomography), as a
-    share of theirs (0: nothing is). With 0.5 sparse matter, such as a crack, gains most. Of thick soft matter frames do
+    """Width of the matter at either side of the frames that is an unknown (interior tomography), as a share of theirs
+    (0: there is none). With 0.5 sparse matter, such as a crack, gains most. Of thick soft matter frames do
     not say how much lies inside, and its error may grow."""
     backend: Backend = "auto"
     """What computes it."""
@@ -219,15 +219,15 @@ def _tomography(
     """Phase retrieval of each view and total variation: the solver, on voxels of one pixel.
 
     Where its volume has matter at the top or at the bottom, both are done anew with matter beyond the frames; but not
-    where a bound says how much of it there is (`_leaving`). Where it has matter at the sides, they are done with what
-    lies beyond as unknown: its rays have no weight.
+    where a bound says how much of it there is (`_leaving`). So they are with what lies at the
+    sides, where that is an unknown (`beside`): its rays have no weight.
     """
     if lines is None:
         lines = retrieved(scan, material, options, on_progress, light)
     solver = _volume_of(lines, scan, material, options, on_progress)
     free = options.beyond and options.still_light == 0
     rows = rows_beyond(solver.volume, scan, material.beta / material.delta) if free and options.upper == 0 else 0
-    columns = columns_beyond(solver.lines(), scan, options.beside) if free else 0
+    columns = columns_beyond(scan.views, options.beside) if free else 0
     if not (rows or columns):
         return solver
     lines = retrieved(scan, material, options, on_progress, light, leaves=(rows > 0, columns > 0))
