@@ -249,6 +249,11 @@ class MaterialPrior:
         """The bound `upper` of the occupancy where the level of the material is known, else 0 (none)."""
         return upper if self.fixes_level else 0.0
 
+    @property
+    def lower(self) -> float:
+        """The bound of an occupancy from below: 0, or none (-inf) where matter may lie on both sides of its medium."""
+        return -math.inf if self.two_sided else 0.0
+
     def as_dict(self) -> dict[str, Any]:
         """Plain values, ready for JSON, as config.json holds them."""
         first = self.materials[0] if self.materials else DeltaBeta(0.0, 0.0)

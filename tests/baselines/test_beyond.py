@@ -10,7 +10,7 @@ import torch
 
 from helpers.blobs import MATERIAL, PIXEL, SHAPE, blob_lines, blob_scan, blobs
 from holosplat.baselines import HolographicTV, holographic_tv
-from holosplat.baselines.beyond import carried_on, rows_beyond, rows_of
+from holosplat.baselines.beyond import carried_on, margins_of, rows_beyond
 from holosplat.baselines.holographic_tv import Correction
 from holosplat.fit.smooth_volume import ContinuousPrior, VolumeProblem
 from holosplat.fit.whitened import WhitenedFrames
@@ -22,6 +22,7 @@ from holosplat.methods.surface_fit import field_of
 from holosplat.methods.volume import SmoothStage, SmoothVolume
 from holosplat.optics.noise_model import NoiseModel
 from holosplat.optics.retrieval import bounded_estimate
+from holosplat.optics.retrieval.bounded import NOWHERE
 from holosplat.representations import GaussianCloud, VoxelGrid
 from holosplat.representations.initialise import cloud_from_volume
 from holosplat.scan import Scan
@@ -37,7 +38,7 @@ def cut(top: int = TOP, rows: int = ROWS, photons: float | None = None) -> Scan:
 
 def whitened(measured: Scan, beyond: int) -> WhitenedFrames:
     noise = NoiseModel.white_only(torch.full((len(measured),), 0.01, dtype=torch.float64), measured.views.shape)
-    return WhitenedFrames(measured, MATERIAL, noise, beyond=beyond)
+    return WhitenedFrames(measured, MATERIAL, noise, beyond=(beyond, 0))
 
 
 def quiet(stage: str, fraction: float) -> None:
@@ -90,7 +91,7 @@ def test_a_volume_of_cut_frames_keeps_its_matter():
     """Air beyond the frames takes a part of it away, as of a volume that ends with them."""
     part, options = cut(5, 15, 20_000), HolographicTV(upper=0.0, refine=1, noisy=1.0)
     volume, grid = holographic_tv(part, MATERIAL, options, quiet)
-    beyond = rows_of(grid, part.views)
+    beyond, _ = margins_of(grid, part.views)
     truth = blobs(Grid.of_views(part.views))
     found = volume[:, beyond:-beyond]
     assert 0.84 < float(found.sum() / truth.sum()) < 1.1
@@ -104,7 +105,7 @@ def test_a_smooth_volume_of_cut_frames_goes_on_beyond_them():
     quick = HolographicTV(upper=0.0, refine=1, retrieval=20, iterations=40, corrections=0)
     stage = SmoothStage(SmoothVolume(quick, rounds=1, iterations=2))
     start = stage.start(task, None)
-    assert rows_of(start.grid, part.views) > 0
+    assert margins_of(start.grid, part.views)[0] > 0
     fit = stage.fit(task, start)
     assert fit.voxels.grid == start.grid
     contrast = np.sqrt(np.square(part.frames - 1.0).mean(axis=(1, 2)))
@@ -115,7 +116,9 @@ def test_a_smooth_volume_of_cut_frames_goes_on_beyond_them():
 def test_retrieval_and_corrections_go_on_beyond_the_frames():
     part = cut()
     frames, missing = torch.from_numpy(part.frames), torch.from_numpy(part.frames) - 1
-    kept, free = (bounded_estimate(frames, part.exposures, RATIO, None, leaves).phase for leaves in (False, True))
+    kept, free = (
+        bounded_estimate(frames, part.exposures, RATIO, None, leaves).phase for leaves in (NOWHERE, (True, False))
+    )
     assert float(free[:, :2].sum() + free[:, -2:].sum()) > float(kept[:, :2].sum() + kept[:, -2:].sum())
     inside, taller = (Correction(part, MATERIAL, beyond)(missing) for beyond in (0, BEYOND))
     assert taller.shape == (6, ROWS + 2 * BEYOND, SHAPE[1])

@@ -6,14 +6,17 @@ import json
 import shutil
 from dataclasses import replace
 
+import h5py
 import numpy as np
 import tifffile
 
+import holosplat as hs
 from helpers.cli import holosplat, refused, worked
 from holosplat.io.formats import read_volume_file
 from holosplat.io.objects import read_object, read_series
 from holosplat.io.ome import write_ome_tiff
 from holosplat.io.volumes import read_volume, write_volume
+from holosplat.optics.sampling import views_seeing
 
 
 def test_a_run_is_exported_in_few_bytes_and_as_a_tiff(shop, tmp_path):
@@ -22,6 +25,20 @@ def test_a_run_is_exported_in_few_bytes_and_as_a_tiff(shop, tmp_path):
     assert read_object(tmp_path / "c.h5").described == read_object(shop.run / "object.h5").described
     with tifffile.TiffFile(tmp_path / "v.ome.tif") as file:
         assert file.series[0].axes == "CZYX"
+
+
+def test_an_hdf5_volume_says_how_many_views_show_each_voxel(shop, tmp_path):
+    run = shutil.copytree(shop.run, tmp_path / "run")
+    worked(holosplat("export", run, "--volume", tmp_path / "v.h5", "--shape", 9, 8, 11))
+    scan, volume = hs.read(shop.scan), read_volume(tmp_path / "v.h5")
+    with h5py.File(tmp_path / "v.h5") as file:
+        counted = file["views"]
+        np.testing.assert_array_equal(counted, views_seeing(scan.train().exposures, volume.grid))
+        assert counted.attrs["axes"] == "z, y, x"
+    (run / "source.json").unlink()
+    done = worked(holosplat("export", run, "--volume", tmp_path / "w.h5"))
+    assert "w.h5 has no /views, for the run's scan cannot be read" in done.err
+    assert "views" not in h5py.File(tmp_path / "w.h5")
 
 
 def test_a_step_without_sense_leaves_nothing(shop, tmp_path):

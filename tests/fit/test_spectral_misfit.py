@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -67,11 +68,11 @@ def test_noise_is_measured_between_shapes(sigma):
 
 
 def minimised(
-    value: Callable[[Tensor], Tensor], start: Tensor, upper: float, steps: int
+    value: Callable[[Tensor], Tensor], start: Tensor, upper: float, steps: int, lower: float = 0.0
 ) -> tuple[Tensor, list[Tensor]]:
     """The best point after some steps, and every point that was tried."""
     leaves, seen = {"x": start.clone().requires_grad_()}, []
-    optimiser = ProjectedGradient(leaves, upper)
+    optimiser = ProjectedGradient(leaves, upper, lower=lower)
     for _ in range(steps):
         seen.append(leaves["x"].detach().clone())
         loss = value(leaves["x"])
@@ -86,9 +87,10 @@ def test_the_minimiser_finds_the_bounded_minimum():
     scale = torch.logspace(0, 3, 30, dtype=torch.float64)
     target = torch.linspace(-0.5, 1.5, 30, dtype=torch.float64)
     start = torch.full_like(target, 0.5)
-    found, seen = minimised(lambda x: 0.5 * (scale * (x - target) ** 2).sum(), start, 1.0, 80)
-    assert torch.allclose(found, target.clamp(0, 1), atol=1e-6)
-    assert all(float(x.min()) >= 0 and float(x.max()) <= 1 for x in seen)
+    for lower, steps in ((0.0, 80), (-0.25, 80), (-math.inf, 160)):
+        found, seen = minimised(lambda x: 0.5 * (scale * (x - target) ** 2).sum(), start, 1.0, steps, lower)
+        assert torch.allclose(found, target.clamp(lower, 1), atol=1e-6)
+        assert all(float(x.min()) >= lower and float(x.max()) <= 1 for x in seen)
 
 
 def test_the_minimiser_returns_the_best_point_and_refuses_nonsense():

@@ -10,6 +10,7 @@ from urllib.parse import unquote
 import matplotlib
 import numpy as np
 import pytest
+from matplotlib.contour import QuadContourSet
 
 from helpers.pictures import undrawn
 from helpers.report_page import BARE, DELTA, PITCH, Page, ball, content, scene
@@ -27,6 +28,7 @@ from holosplat.report.curves import histogram_figure
 from holosplat.report.figures import richest_planes, scene_figure, slices_figure
 from holosplat.report.style import GROUND, INK, data_uri
 from holosplat.report.surface import Deviation, camera
+from holosplat.units import in_percent
 from holosplat.volume import Volume
 
 HERO = Path(__file__).parents[2] / "docs" / "pictures" / "hero.py"
@@ -92,6 +94,35 @@ def test_figures_have_the_colours_of_dark_pages_and_images_keep_theirs():
     assert not re.search(f": ({INK}|{GROUND})(?!;--|;}})", drawn.split("</style>", 1)[1])
     assert drawn.count("data:image/png;base64,") >= 9
     assert "#ffffff" in drawn  # a scale bar on a dark image
+
+
+def test_slices_enclose_what_all_views_show():
+    """Where all is shown, or nothing of a plane, there is no line."""
+    truth, found = scene()
+    planes = richest_planes(truth)
+    seen = np.zeros(truth.grid.shape, dtype=bool)
+    seen[:, 3:-2, 4:-5] = True
+    figure = slices_figure(found, truth, planes, seen=seen)
+    lines = [[c for c in axes.collections if isinstance(c, QuadContourSet)] for axes in figure.axes]
+    assert sum(map(len, lines)) == 9  # three planes of truth, reconstruction and difference
+    (drawn,) = lines[0][0].get_paths()
+    low, high = drawn.vertices.min(axis=0) / PITCH, drawn.vertices.max(axis=0) / PITCH
+    np.testing.assert_allclose(low, (4, 3), atol=0.51)
+    np.testing.assert_allclose(high, (28 - 5, 20 - 2), atol=0.51)
+    for everything in (np.ones_like(seen), None):
+        figure = slices_figure(found, truth, planes, seen=everything)
+        assert not any(isinstance(c, QuadContourSet) for axes in figure.axes for c in axes.collections)
+
+
+def test_the_report_says_how_much_matter_some_views_miss(undrawn_reports):
+    truth, _ = scene()
+    seen = np.zeros(truth.grid.shape, dtype=bool)
+    seen[:, : truth.grid.shape[1] // 2] = True
+    share = float(truth.delta[~seen].sum() / truth.delta.sum())
+    page = Page(render_page(content(reconstruction=truth, seen=seen))).text
+    assert f"Beyond it lies {in_percent(share)} of the matter" in page
+    for all_of_it in (None, np.ones_like(seen)):
+        assert "dashed line" not in Page(render_page(content(seen=all_of_it))).text
 
 
 def test_bare_report_says_what_is_absent(bare_page):

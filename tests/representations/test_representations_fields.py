@@ -153,11 +153,16 @@ ONE = Matter.one(1.0, 0.0)
 
 
 def smooth(
-    grid: Grid, matter: Matter = ONE, network: Network = SMALL, mask: torch.Tensor | None = None, upper: float = 1.0
+    grid: Grid,
+    matter: Matter = ONE,
+    network: Network = SMALL,
+    mask: torch.Tensor | None = None,
+    upper: float = 1.0,
+    lower: float = 0.0,
 ) -> NeuralField:
     """A field with some structure, in float64."""
     full = torch.ones(grid.shape, dtype=torch.bool) if mask is None else mask
-    return pronounced(NeuralField(grid, matter, network, full, 1, upper))
+    return pronounced(NeuralField(grid, matter, network, full, 1, upper, lower=lower))
 
 
 @pytest.mark.parametrize("kind", ["hash", "fourier"])
@@ -204,13 +209,19 @@ def test_a_uniform_field_has_the_length_of_its_box():
 
 
 @pytest.mark.parametrize(
-    ("matter", "upper"), [(Matter.one(1.0, 0.1), 1.0), (Matter.one(1.0, 0.1), 0.0), (Matter.free(1.0, 0.1), 1.0)]
+    ("matter", "bounds"),
+    [
+        (Matter.one(1.0, 0.1), (0.0, 1.0)),
+        (Matter.one(1.0, 0.1), (0.0, 0.0)),
+        (Matter.free(1.0, 0.1), (0.0, 1.0)),
+        (Matter.one(1.0, 0.1), (-math.inf, 0.0)),
+    ],
 )
 @pytest.mark.parametrize("log2_size", [4, 12], ids=["hashed", "dense"])
-def test_gradients_are_those_of_finite_differences(matter, upper, log2_size):
+def test_gradients_are_those_of_finite_differences(matter, bounds, log2_size):
     """In float64, along a random direction of each parameter."""
     network = Network(Encoding(levels=2, features=2, coarsest=8.0, finest=3.0, log2_size=log2_size), 8, 1)
-    start = smooth(Grid.centred((7, 5, 9), PIXEL), matter, network, upper=upper)
+    start = smooth(Grid.centred((7, 5, 9), PIXEL), matter, network, upper=bounds[1], lower=bounds[0])
     leaves = {name: p.clone().requires_grad_() for name, p in start.parameters().items()}
     field = start.with_parameters(leaves)
     views = any_pose(1, (5, 7)).refined(2)
@@ -309,6 +320,14 @@ CUBE = Grid.centred((3, 3, 3), 1.0)
         (lambda: Matter(((1.0, 0.0),) * 3, occupancies=False), "have a channel each, but matter has 3"),  # type: ignore[arg-type]
         (lambda: NeuralField(CUBE, Matter.one(0.0, 0.0), SMALL, torch.ones(3, 3, 3)), "matter with a δ"),
         (lambda: NeuralField(CUBE, ONE, SMALL, torch.ones(3, 3, 3), upper=-1.0), "upper must not be negative"),
+        (
+            lambda: NeuralField(CUBE, ONE, SMALL, torch.ones(3, 3, 3), lower=-1.0),
+            "lower must be 0 or -inf",
+        ),
+        (
+            lambda: NeuralField(CUBE, ONE, SMALL, torch.ones(3, 3, 3), lower=-math.inf),
+            "has no upper one",
+        ),
         (lambda: NeuralField(CUBE, ONE, SMALL, torch.ones(2, 3, 3)), "mask"),
     ],
 )

@@ -45,19 +45,23 @@ def sirt(
     *,
     options: Algebraic = Algebraic(),
     missing: Tensor | None = None,
+    two_sided: bool = False,
 ) -> Tensor:
     """Occupancy [Z, Y, X] on `grid` from thickness `lines` [V, H, W] in metres, by SIRT from zero; float32.
 
     `x ← x + ω C Aᵀ R (b - A x)` with R and C one over the sums of A's rows and columns (Gregor & Benson 2008, eq. 2),
-    then the bounds: `upper`, and zero if `options.nonnegative`.
+    then the bounds: `upper`, and zero if `options.nonnegative` and not `two_sided`.
     """
     top, rays = checked_upper(upper), rays_of(lines, views, grid, missing=missing)
+    lowest = 0.0 if options.nonnegative and not two_sided else None
     with memory_kept():
-        return _simultaneous(rays, top, on_progress, options)
+        return _simultaneous(rays, (lowest, top), on_progress, options)
 
 
-def _simultaneous(rays: Rays, top: float | None, on_progress: Advance, options: Algebraic) -> Tensor:
-    projector, lowest = rays.projector, 0.0 if options.nonnegative else None
+def _simultaneous(
+    rays: Rays, bounds: tuple[float | None, float | None], on_progress: Advance, options: Algebraic
+) -> Tensor:
+    projector = rays.projector
     volume = torch.zeros(projector.array_shape)
     known = torch.ones_like(rays.measured) if rays.known is None else rays.known
     per_ray = _reciprocal(projector.project(torch.ones_like(volume))).mul_(known)
@@ -66,7 +70,7 @@ def _simultaneous(rays: Rays, top: float | None, on_progress: Advance, options: 
         on_progress(done / options.sweeps)
         missing = (rays.measured - projector.project(volume)).mul_(per_ray)
         volume.addcmul_(per_voxel, projector.backproject(missing))
-        bounded(volume, lowest, top)
+        bounded(volume, *bounds)
     return projector.volume_out(volume)
 
 
@@ -79,16 +83,17 @@ def art(
     *,
     options: Algebraic = Algebraic(sweeps=40, relaxation=0.5, nonnegative=True),
     missing: Tensor | None = None,
+    two_sided: bool = False,
 ) -> Tensor:
     """Occupancy [Z, Y, X] on `grid` from thickness `lines` [V, H, W] in metres, by ART from zero; float32.
 
     Kaczmarz' method (Gordon, Bender & Herman 1970): `x ← x + ω aᵢ (bᵢ - ⟨aᵢ, x⟩) / |aᵢ|²`, ray by ray. Rays of a view
     that share no voxel are orthogonal, so each such set is taken at once, which gives the same as one after the other.
     Views follow each other by the golden section, so that successive ones differ. Bounds are imposed after each view
-    (the same authors' partially constrained ART: not below zero, unless `options` say otherwise).
+    (the same authors' partially constrained ART: not below zero, unless `options` say otherwise, or it is `two_sided`).
     """
     top, rays = checked_upper(upper), rays_of(lines, views, grid, missing=missing)
-    lowest = 0.0 if options.nonnegative else None
+    lowest = 0.0 if options.nonnegative and not two_sided else None
     with memory_kept():
         steps = _orthogonal_sets(rays)
         volume = torch.zeros(rays.projector.array_shape)

@@ -1,7 +1,8 @@
-"""Matter that goes on above and below the frames: in how many rows there a volume must have it.
+"""Matter that goes on beyond the frames: in how many rows above and below, and columns at the sides, a volume has it.
 
 Fringes of what lies a few rows beyond a frame reach into it, and soft matter is seen by how its shadow bends from row
-to row. A volume that ends with the frames has air there instead, and is wrong far into them.
+to row. A volume that ends with the frames has air there instead, and is wrong far into them. Matter at the sides lies
+on the rays of other views (interior tomography).
 """
 
 from __future__ import annotations
@@ -26,7 +27,9 @@ SURE = 4.0
 ROOM = 2
 """Rows beyond the reach of fringes and blur, for what a volume cannot have in its outermost ones."""
 MULTIPLE = 4
-"""Rows beyond are a multiple of so many, so that larger pixels divide them, too."""
+"""Rows and columns beyond are a multiple of so many, so that larger pixels divide them, too."""
+Margins = tuple[int, int]
+"""Rows above and below, and columns on either side."""
 
 
 def rows_beyond(volume: Tensor, scan: Scan, ratio: float) -> int:
@@ -49,11 +52,31 @@ def rows_beyond(volume: Tensor, scan: Scan, ratio: float) -> int:
     return MULTIPLE * math.ceil((fringe_reach(exposures, fringe_sampling(exposures)) + ROOM) / MULTIPLE)
 
 
-def carried_on(images: Tensor, rows: int) -> Tensor:
-    """Images [V, H, W] with `rows` more above and below, as their outermost ones: [V, H + 2 rows, W]."""
-    return pad(images[None], (0, 0, rows, rows), mode="replicate")[0] if rows else images
+def columns_beyond(views: Views, share: float) -> int:
+    """Columns on either side of the frames of `views` in which a volume has matter: this `share` of them.
+
+    Matter that leaves the frames sideways lies on the rays of other views. A volume that ends with the frames takes it
+    for matter inside.
+    """
+    return MULTIPLE * math.ceil(share * views.shape[1] / MULTIPLE)
 
 
-def rows_of(grid: Grid, views: Views) -> int:
-    """Rows above and below the frames of `views` that a volume on `grid` has."""
-    return max(0, round(0.5 * (grid.shape[1] * grid.voxel_size[1] / views.finest - views.shape[0])))
+def carried_on(images: Tensor, rows: int, columns: int = 0) -> Tensor:
+    """Images [V, H, W] with `rows` more above and below, and `columns` at either side, as their outermost ones."""
+    return pad(images[None], (columns, columns, rows, rows), mode="replicate")[0] if rows or columns else images
+
+
+def margins_of(grid: Grid, views: Views) -> Margins:
+    """Rows above and below the frames of `views`, and columns at either side, that a volume on `grid` has."""
+    size = (grid.shape[1] * grid.voxel_size[1], grid.shape[2] * grid.voxel_size[0])
+    rows, columns = (max(0, round(0.5 * (n / views.finest - seen))) for n, seen in zip(size, views.shape))
+    return rows, columns
+
+
+def unseen_rays(scan: Scan, beyond: Margins) -> Tensor | None:
+    """Rays [V, H, W] bool, with those `beyond` the frames, that say nothing: of missing pixels, and at the sides."""
+    rows, columns = beyond
+    if scan.gaps is None and columns == 0:
+        return None
+    inside = torch.zeros(len(scan), *scan.views.shape, dtype=torch.bool) if scan.gaps is None else scan.gaps
+    return pad(carried_on(inside.float(), rows), (columns, columns), value=1.0) > 0

@@ -42,6 +42,7 @@ def filtered_backprojection(
     *,
     options: Ramp = Ramp(),
     missing: Tensor | None = None,
+    two_sided: bool = False,
 ) -> Tensor:
     """Occupancy [Z, Y, X] on `grid` from thickness `lines` [V, H, W] in metres; float32.
 
@@ -61,7 +62,7 @@ def filtered_backprojection(
     views, grid = in_pixels(lines, views, grid)
     filtered = _filtered(lines.float() / pitch, options) * angular_weights(views)[:, None, None]
     volume = _smeared(filtered, views, grid, on_progress)
-    return bounded(volume, 0.0 if options.nonnegative else None, top)
+    return bounded(volume, 0.0 if options.nonnegative and not two_sided else None, top)
 
 
 def _explained(lines: Tensor, views: Views, grid: Grid, missing: Tensor) -> Tensor:

@@ -14,6 +14,7 @@ from functools import partial
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from ..backends import Backend, device, resolve
 from ..checks import at_least
@@ -25,14 +26,14 @@ from ..optics.background import Light
 from ..optics.noise import noise_share
 from ..optics.noise_model import NoiseModel
 from ..optics.retrieval import Tikhonov, absorption_alone, tikhonov
-from ..optics.retrieval.bounded import FIXED, MODEL_ERROR
+from ..optics.retrieval.bounded import FIXED, MODEL_ERROR, NOWHERE, Leaves
 from ..optics.retrieval.spectra import Raster, filtered, radian, response, spectra, surrounded
 from ..optics.sampling import fringe_sampling
 from ..progress import Progress
 from ..projectors.voxels import projector_for
 from ..ranges import Metres, Weight, ranged
 from ..scan import Scan
-from .beyond import carried_on, rows_beyond
+from .beyond import Margins, carried_on, columns_beyond, rows_beyond, unseen_rays
 from .primal_dual import PrimalDual
 from .rays import photons_left, rays_of
 from .tomography import TotalVariation, tv_solver
@@ -95,6 +96,10 @@ class HolographicTV:
     beyond: bool = True
     """Whether a volume without a bound has rows of its own above and below the frames where matter goes on there; else
     it goes on as in its outermost ones."""
+    beside: Weight = 0.0
+    """Width of the matter at either side of the frames that is an unknown (interior tomography), as a share of theirs
+    (0: there is none). With 0.5 sparse matter, such as a crack, gains most. Of thick soft matter frames do
+    not say how much lies inside, and its error may grow."""
     backend: Backend = "auto"
     """What computes it."""
 
@@ -135,15 +140,14 @@ def retrieved(
     options: HolographicTV,
     on_progress: Progress,
     light: Light | None = None,
-    leaves: bool = False,
+    leaves: Leaves = NOWHERE,
 ) -> Tensor:
     """Thickness [V, H, W] of `material` [m], which phase retrieval finds in every view by itself; leaves: whether
-    matter goes on above and below the frames."""
+    matter goes on above and below the frames, and at their sides."""
     backend, noise = resolve(options.backend), correlated(light)
-    how = Tikhonov(
-        iterations=options.retrieval, backend=backend, leaves=leaves, noise=noise, two_sided=options.two_sided
-    )
+    how = Tikhonov(iterations=options.retrieval, backend=backend, leaves=leaves, noise=noise)
     known = {"options": how, "missing": scan.gaps, "on_progress": partial(on_progress, "phase retrieval")}
+    known["two_sided"] = options.two_sided
     return tikhonov(torch.from_numpy(scan.frames), scan.exposures, *material, **known)
 
 
@@ -215,17 +219,19 @@ def _tomography(
     """Phase retrieval of each view and total variation: the solver, on voxels of one pixel.
 
     Where its volume has matter at the top or at the bottom, both are done anew with matter beyond the frames; but not
-    where a bound says how much of it there is (`_leaving`).
+    where a bound says how much of it there is (`_leaving`). So they are with what lies at the
+    sides, where that is an unknown (`beside`): its rays have no weight.
     """
     if lines is None:
         lines = retrieved(scan, material, options, on_progress, light)
     solver = _volume_of(lines, scan, material, options, on_progress)
-    free = options.beyond and options.upper == 0 and options.still_light == 0
-    beyond = rows_beyond(solver.volume, scan, material.beta / material.delta) if free else 0
-    if not beyond:
+    free = options.beyond and options.still_light == 0
+    rows = rows_beyond(solver.volume, scan, material.beta / material.delta) if free and options.upper == 0 else 0
+    columns = columns_beyond(scan.views, options.beside) if free else 0
+    if not (rows or columns):
         return solver
-    lines = carried_on(retrieved(scan, material, options, on_progress, light, leaves=True), beyond)
-    return _volume_of(lines, scan, material, options, on_progress)
+    lines = retrieved(scan, material, options, on_progress, light, leaves=(rows > 0, columns > 0))
+    return _volume_of(carried_on(lines, rows, columns), scan, material, options, on_progress)
 
 
 def correlated(light: Light | None) -> NoiseModel | None:
@@ -239,10 +245,9 @@ def correlated(light: Light | None) -> NoiseModel | None:
 def _volume_of(
     lines: Tensor, scan: Scan, material: DeltaBeta, options: HolographicTV, on_progress: Progress
 ) -> PrimalDual:
-    """Total variation on the thickness [V, H, W] of views, which may have rows beyond the frames."""
-    beyond = (lines.shape[1] - scan.views.shape[0]) // 2
-    field, gaps = scan.views.taller(beyond), scan.gaps
-    gaps = None if gaps is None else carried_on(gaps.float(), beyond) > 0
+    """Total variation on the thickness [V, H, W] of views, which may have rows and columns beyond the frames."""
+    beyond = _margins(lines, scan)
+    field, gaps = scan.views.padded(beyond), unseen_rays(scan, beyond)
     rays = rays_of(lines, field, Grid.of_views(field), options.backend, gaps)
     first = min(TotalVariation.first, options.iterations)
     known = {"still_light": options.still_light, "misfit": options.misfit, "two_sided": options.two_sided}
@@ -303,8 +308,10 @@ def _agree(
     """
     pitch = scan.views.finest
     field = _field(scan, coarse)
-    beyond, views = (field.shape[0] - scan.views.shape[0]) // 2, field.in_units_of(pitch)
-    correction = Correction(scan, material, beyond, correlated(light))
+    beyond, views = _margins(coarse.volume, scan), field.in_units_of(pitch)
+    unseen = unseen_rays(scan, beyond)
+    unseen = None if unseen is None else refined(unseen.float(), refine).to(coarse.volume.device) > 0.5
+    correction = Correction(scan, material, beyond[0], correlated(light))
     finer = math.ceil(fringe_sampling(scan.exposures) / refine)
     instrument = Instrument(scan.exposures, refine * finer, backend=options.backend)
     frames = torch.from_numpy(scan.frames).to(instrument.device)
@@ -326,15 +333,21 @@ def _agree(
         if misfit < least or done <= options.settling:
             best, least = solver.volume.clone(), misfit
         if done < options.corrections:
-            more = correction(missing)
-            solver.run(lines + refined(more / pitch, refine), inner)
+            more = pad(correction(missing), (beyond[1], beyond[1]))
+            solver.run(lines + refined(more / pitch, refine), inner, unseen)
     best, grid = carried_on(best, carried * refine), Grid.of_views(views.taller(carried), refine)
     return best, _in_metres(grid, pitch)
 
 
 def _field(scan: Scan, solver: PrimalDual) -> Views:
-    """The views with the rows that the volume of `solver`, on voxels of a pixel, has beyond the frames."""
-    return scan.views.taller((solver.volume.shape[1] - scan.views.shape[0]) // 2)
+    """The views with the rows and columns that the volume of `solver`, on voxels of a pixel, has beyond the frames."""
+    return scan.views.padded(_margins(solver.volume, scan))
+
+
+def _margins(array: Tensor, scan: Scan) -> Margins:
+    """Rows and columns beyond the frames on either side, of a volume [Z, Y, X] or of images [V, H, W], on pixels."""
+    rows, columns = ((n - seen) // 2 for n, seen in zip(array.shape[1:], scan.views.shape))
+    return rows, columns
 
 
 class Correction:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -40,10 +40,12 @@ class Tomography(Protocol):
         /,
         *,
         missing: Tensor | None = None,
+        two_sided: bool = False,
     ) -> Tensor:
         """The occupancy [Z, Y, X], dimensionless float32, never above `upper`; `on_progress(fraction)` on the way.
 
-        missing: rays [V, H, W] bool of pixels without a value, which have no weight.
+        missing: rays [V, H, W] bool of pixels without a value, which have no weight. two_sided: whether the occupancy
+        may be below zero.
         """
         ...
 
@@ -56,10 +58,11 @@ def sirt_nonnegative(
     on_progress: Advance,
     *,
     missing: Tensor | None = None,
+    two_sided: bool = False,
 ) -> Tensor:
-    """`sirt` with the occupancy kept from going below zero, which lets it run longer."""
+    """`sirt` with the occupancy kept from going below zero, unless it is `two_sided`, which lets it run longer."""
     options = Algebraic(sweeps=200, relaxation=1.9, nonnegative=True)
-    return sirt(lines, views, grid, upper, on_progress, options=options, missing=missing)
+    return sirt(lines, views, grid, upper, on_progress, options=options, missing=missing, two_sided=two_sided)
 
 
 @dataclass(frozen=True)
@@ -94,13 +97,16 @@ def total_variation(
     *,
     options: TotalVariation = TotalVariation(),
     missing: Tensor | None = None,
+    two_sided: bool = False,
 ) -> Tensor:
     """Occupancy [Z, Y, X] ≥ 0 on `grid` from thickness `lines` [V, H, W] in metres, by total variation; float32.
 
-    `min ½ Σ |F[A u - b]|² / S + λ Σ|∇u|` with `0 ≤ u ≤ upper` (see `PrimalDual`). Errors of retrieved thickness are
-    strongest at low frequencies, and by how much depends on noise and optics. So a first solution, with S = 1, tells
-    the power spectrum of what no volume explains, and S is a power of that.
+    `min ½ Σ |F[A u - b]|² / S + λ Σ|∇u|` with `0 ≤ u ≤ upper` (see `PrimalDual`), or `u ≤ upper` where it
+    is `two_sided`. Errors of retrieved thickness are strongest at low frequencies, and by how much depends on noise and
+    optics. So a first solution, with S = 1, tells the power spectrum of what no volume explains, and S is a power of
+    that.
     """
+    options = replace(options, two_sided=two_sided)
     with memory_kept():
         return tv_solver(rays_of(lines, views, grid, missing=missing), upper, options, on_progress).volume
 

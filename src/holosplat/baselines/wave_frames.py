@@ -11,13 +11,12 @@ from ..volume import LineIntegrals
 
 
 def frames_of(instrument: Instrument, lines: Tensor, material: DeltaBeta) -> Tensor:
-    """Frames from thickness [V, H, W] in metres on the unpadded raster, or on a taller one about the same middle.
+    """Frames from thickness [V, H, W] in metres on the unpadded raster, or on a larger one about the same middle.
 
     Matter outside it counts as none.
     """
-    mx, s = instrument.margin[1], instrument.oversample
-    rows = (instrument.views.shape[0] - lines.shape[1]) // 2
-    padded = pad(lines, (mx * s, mx * s, rows, rows))
+    rows, columns = ((n - seen) // 2 for n, seen in zip(instrument.views.shape, lines.shape[1:]))
+    padded = pad(lines, (columns, columns, rows, rows))  # below 0 it cuts
     return instrument.frames(LineIntegrals(padded[:, None], ((material.delta, material.beta),)))
 
 

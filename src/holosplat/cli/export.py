@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
 from tyro.conf import Positional
 
 from ..checks import InputError, as_written, in_range, require
@@ -18,6 +19,7 @@ from .sentence import say
 if TYPE_CHECKING:
     from ..geometry import Grid
     from ..io.volumes import Contents
+    from ..scan import Exposures
     from ..workflows.reconstruct import Reconstruction
     from ..workflows.run_folder import RunFolder
     from .scans import Moment
@@ -62,6 +64,7 @@ def export(
         volume: Volume to write, by its suffix: .h5 or .hdf5, HDF5; .vti, for ParaView and PyVista; .nrrd, for 3D Slicer
             and ITK; .mrc, for ChimeraX; .tif or .tiff, an OME-TIFF; .zarr, a folder of OME-Zarr (extra zarr). NRRD and
             MRC hold δ alone, and β in NAME.beta.nrrd or NAME.beta.mrc. Of absorption alone µ [1/m] stands in δ's place.
+            HDF5 also holds /views, the number of training views that show each voxel, if the run's scan is there.
         shape: Voxels along z, y, x (default: the scan's field of view, Z = X = W, Y = H).
         voxel_size: Edge of a voxel [m] (default: the pixel size).
         bodies: Of a run of surfaces: a folder to make, with one VTK file a body (µm), the largest first, or of a run
@@ -102,7 +105,7 @@ def export(
             if path is bodies:
                 _export_bodies(one, out)
             elif path is volume:
-                grid = _export_volume(one.result, folder, out, shape, voxel_size)
+                grid = _export_volume(one.result, folder, out, (shape, voxel_size), one.frame)
             else:
                 _export_splats(one.result, out)
     for path in timed if every else ():
@@ -237,20 +240,39 @@ def _export_bodies(one: Moment, out: Path) -> None:
     say(f"wrote {out}: {len(one.bodies)} bodies")
 
 
+def _exposures_of(folder: RunFolder, volume: Path, frame: int | None) -> Exposures | None:
+    """The exposures of the training frames (of several times those of number `frame`), for what `volume` holds of them;
+    None, said, where the scan cannot be read."""
+    from ..io.formats import HDF5_SUFFIXES, read_frames, run_reading
+    from ..io.reading import at_time
+    from ..workflows.refine import where_found
+
+    if volume.suffix.lower() not in HDF5_SUFFIXES:
+        return None
+    try:
+        scan = read_frames(folder.source_scan(), run_reading(folder.path))
+    except InputError as error:
+        say(f"{volume} has no /views, for the run's scan cannot be read: {error}")
+        return None
+    scan = where_found(folder, scan if frame is None else at_time(scan, frame))
+    return scan.exposures[np.flatnonzero(~scan.is_test)]
+
+
 def _export_volume(
     result: Reconstruction,
     folder: RunFolder,
     volume: Path,
-    shape: tuple[int, int, int] | None,
-    voxel_size: float | None,
+    sampling: tuple[tuple[int, int, int] | None, float | None],
+    frame: int | None = None,
 ) -> Grid:
     from ..geometry import Grid
-    from ..io.formats import write_volume_file
     from ..io.json import read_json
     from ..planning.acts import of_export
     from ..scan import PIXEL_RANGE_M
+    from ..workflows.export import export as write
     from .room import tell
 
+    shape, voxel_size = sampling
     with as_written(folder.summary, "what reconstruct wrote"):
         detector = read_json(folder.summary)["detector"]
         rows, columns = int(detector["rows"]), int(detector["columns"])
@@ -262,7 +284,7 @@ def _export_volume(
     require(count <= MOST_VOXELS, f"shape must have at most {MOST_VOXELS:.0e} voxels, but it has {count:.0e}.")
     slabs = ((f"an HDF5 file{how}", of_export(shape, ".h5")) for how, shape in _smaller(grid.shape))
     tell("the volume", of_export(grid.shape, volume.suffix.lower()), volume, slabs)
-    write_volume_file(volume, result.object, grid, of=result.contents)
+    write(result, volume, grid, exposures=_exposures_of(folder, volume, frame))
     say(f"wrote {volume}: {' × '.join(map(str, grid.shape))} voxels of {1e6 * grid.voxel_size[0]:.4g} µm")
     return grid
 

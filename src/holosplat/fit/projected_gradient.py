@@ -20,25 +20,25 @@ FIRST_MOVE = 0.1
 
 
 class ProjectedGradient:
-    """An `Optimiser` of one parameter that keeps 0 ≤ x ≤ upper and needs the whole objective in every step.
+    """An `Optimiser` of one parameter that keeps lower ≤ x ≤ upper and needs the whole objective in every step.
 
     Birgin, Martínez & Raydan (2000), section 2, along the projection arc: the value may rise for a while, but not
     above the last few. Step lengths of Barzilai & Borwein (1988), eqs. 5 and 6 in turn (Dai & Fletcher 2005). After a
-    step, the leaf is the next point to be tried; `best` has the best one so far. upper: the bound, or infinity;
-    scale: units of the parameter in which steps are equally long, broadcast to its shape.
+    step, the leaf is the next point to be tried; `best` has the best one so far. upper, lower: the
+    bounds, or infinite; scale: units of the parameter in which steps are equally long, broadcast to its shape.
     """
 
-    def __init__(self, leaves: Leaves, upper: float, scale: Tensor | None = None) -> None:
+    def __init__(self, leaves: Leaves, upper: float, scale: Tensor | None = None, lower: float = 0.0) -> None:
         require(len(leaves) == 1, f"a projected gradient moves one parameter, but {', '.join(leaves)} are free.")
         (self._name,) = leaves
-        self._leaves, self._upper = leaves, upper
+        self._leaves, self._bounds = leaves, (lower, upper)
         self._scale = torch.ones(()) if scale is None else scale
         self._begin()
 
     def _begin(self) -> None:
         leaf = self._leaves[self._name]
         with torch.no_grad():
-            leaf.copy_((leaf / self._scale).clamp(0, self._upper) * self._scale)
+            leaf.copy_((leaf / self._scale).clamp(*self._bounds) * self._scale)
         self._point: Tensor | None = None
         self._slope, self._best = torch.empty(0), leaf.detach() / self._scale
         self._recent: list[float] = []
@@ -65,7 +65,7 @@ class ProjectedGradient:
             self._accept(trial, slope, value)
         self._done += 1
         assert self._point is not None
-        leaf.copy_((self._point - self._length * self._slope).clamp_(0, self._upper) * self._scale)
+        leaf.copy_((self._point - self._length * self._slope).clamp_(*self._bounds) * self._scale)
 
     def _accept(self, point: Tensor, slope: Tensor, value: float) -> None:
         self._point, self._slope, self._recent = point.clone(), slope.clone(), [*self._recent[1 - MEMORY :], value]

@@ -167,10 +167,10 @@ class VolumeProblem:
         """Spectrum of the response of the data's second derivative to one full voxel in the middle."""
         impulse, middle = torch.zeros(self.grid.shape, device=self.device), [n // 2 for n in self.grid.shape]
         impulse[tuple(middle)] = 1.0
-        lines, shape, beyond = self.lines(impulse), self.frames.shape, self.frames.beyond
-        seen = lines[:, beyond : beyond + shape[0]]
+        lines, shape, (rows, columns) = self.lines(impulse), self.frames.shape, self.frames.beyond
+        seen = lines[:, rows : rows + shape[0], columns : columns + shape[1]]
         curved = torch.fft.irfft2(torch.fft.rfft2(seen) * self.frames.curvature(), s=shape)
-        curved = pad(curved, (0, 0, beyond, beyond))
+        curved = pad(curved, (columns, columns, rows, rows))
         answer = torch.roll(self.backprojection(curved), [-m for m in middle], (0, 1, 2))
         return torch.fft.rfftn(answer).real.clamp_min(0)
 

@@ -81,12 +81,13 @@ class WhitenedFrames:
     its power by `NoiseModel`, at each spatial frequency, with the part of the contrast that sampled matter cannot
     explain (`model_error`) beside it, or frames without noise would be trusted without end. F is the unitary `rfft2`.
     The unknowns are line integrals [V, H, W] of one material's occupancy, in (the smallest) pixels of path length; with
-    matter `beyond` the frames, H is that of `field`.
+    matter `beyond` the frames, H and W are those of `field`.
 
-    train: the frames; material: δ and β of an occupancy of one; noise: their noise; light: a factor of each frame,
-    None for even light; oversample: wave samples a pixel (0: as the first fringe needs); beyond: rows above and
-    below the frames in which there may be matter; doubt: uneven light that the frames were divided by, of which what is
-    not known is then an unknown of each frame (`LightProjection`): P with it in the `noise` is only its mean.
+    train: the frames; material: δ and β of an occupancy of one; noise: their noise; light: a factor of each frame, None
+    for even light; oversample: wave samples a pixel (0: as the first fringe needs); beyond: rows above and below the
+    frames, and columns at either side, in which there may be matter; doubt: uneven light that the frames were divided
+    by, of which what is not known is then an unknown of each frame (`LightProjection`): P with it in the `noise` is
+    only its mean.
     """
 
     def __init__(
@@ -97,14 +98,14 @@ class WhitenedFrames:
         light: LightField | None = None,
         backend: str = "cpu",
         oversample: int = 0,
-        beyond: int = 0,
+        beyond: tuple[int, int] = (0, 0),
         *,
         doubt: Light | None = None,
     ) -> None:
         exposures = train.exposures
         self.train, self.material, self.beyond = train, material, beyond
-        self.field = train.views.taller(beyond)
-        """The views with the rows beyond."""
+        self.field = train.views.padded(beyond)
+        """The views with the rows and columns beyond."""
         self.instrument = Instrument(exposures, oversample or fringe_sampling(exposures), backend=backend)
         self.shape, self.pixel = (train.views.shape[0], train.views.shape[1]), train.views.finest
         frames, on = torch.from_numpy(train.frames), self.instrument.device
@@ -162,7 +163,7 @@ class WhitenedFrames:
     def _waves(self, lines: Tensor) -> Tensor:
         """Line integrals [V, H, W] in pixels as those [m] on the raster of the waves."""
         (my, mx), s = self.instrument.margin, self.instrument.oversample
-        my -= self.beyond
+        (my, mx) = (m - more for m, more in zip((my, mx), self.beyond))  # below 0 it cuts
         padded = pad(lines, (mx, mx, my, my)) * self.pixel
         h, w = padded.shape[-2:]
         spectrum = torch.fft.rfft2(padded) * self._sharp

@@ -34,7 +34,7 @@ from .reading import Reading
 from .stacks import all_images
 from .stored_frames import Mended, with_fields
 from .table import Table
-from .volumes import REFRACTION, VOXEL_RANGE_M, Contents, Stored, read_stored, write_voxels
+from .volumes import REFRACTION, VOXEL_RANGE_M, Contents, Stored, ViewCount, read_stored, write_voxels
 from .vti import read_vti, write_vti
 
 SOURCE, SUMMARY = "source.json", "summary.json"
@@ -255,10 +255,21 @@ def volume_format(path: Path, called: str = "a volume") -> VolumeFormat:
 
 
 def write_volume_file(
-    path: Path, obj: Object, grid: Grid, on_progress: Advance = lambda fraction: None, of: Contents = REFRACTION
+    path: Path,
+    obj: Object,
+    grid: Grid,
+    on_progress: Advance = lambda fraction: None,
+    of: Contents = REFRACTION,
+    seen: ViewCount | None = None,
 ) -> None:
-    """Write δ and β (or what arrays are `of`) of `obj` on `grid` in the format that the suffix of `path` names."""
-    volume_format(path).write(path, obj, grid, on_progress, of)
+    """Write δ and β (or what arrays are `of`) of `obj` on `grid` in the format that the suffix of `path` names.
+
+    seen: what counts the views that show each voxel; of the formats only HDF5 holds that.
+    """
+    if seen is not None and path.suffix.lower() in HDF5_SUFFIXES:
+        write_voxels(path, obj, grid, on_progress, of, seen)
+    else:
+        volume_format(path).write(path, obj, grid, on_progress, of)
 
 
 def of_time(path: Path, frame: int) -> Path:

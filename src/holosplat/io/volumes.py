@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,6 +24,10 @@ SAID = {"voxel_size_units": "m", "origin_units": "m", "axes": "z, y, x"}
 """Attributes for people and other programs; lengths are (x, y, z)."""
 MU = "mu_per_m"
 """The attenuation coefficient, which stands in place of δ where that is not known."""
+SEEN = "views"
+"""How many views show each voxel."""
+ViewCount = Callable[[Grid], np.ndarray]
+"""The number of views that show each voxel of a grid, [Z, Y, X]."""
 SLAB_VOXELS = 1 << 22
 """Voxels that `write_voxels` makes at once: meshes take about 250 MB for them."""
 
@@ -144,22 +148,32 @@ def write_volume(path: str | Path, volume: Volume) -> None:
     write_slabs(path, volume.grid, [(0, volume)])
 
 
-def write_slabs(path: str | Path, grid: Grid, slabs: Iterable[tuple[int, Volume]], of: Contents = REFRACTION) -> None:
+def write_slabs(
+    path: str | Path,
+    grid: Grid,
+    slabs: Iterable[tuple[int, Volume]],
+    of: Contents = REFRACTION,
+    seen: ViewCount | None = None,
+) -> None:
     """Write the volume on `grid` from its parts `slabs`, each with the y index of its first slice.
 
     Attributes say units and axes, too. The parts must cover the grid; `path` is replaced only once all are written.
+    seen: what counts the views that show each voxel, for /views.
     """
     attributes = {"voxel_size": np.array(grid.voxel_size), "origin": np.array(grid.origin), **SAID}
-    with new_hdf5(path, 4 * len(NAMES) * math.prod(grid.shape)) as file:
+    with new_hdf5(path, (4 * len(NAMES) + 2 * (seen is not None)) * math.prod(grid.shape)) as file:
         file.attrs.update(attributes)
         chunk = (grid.shape[0], 1, grid.shape[2])  # slabs are whole in z and x
-        arrays = {name: room_for(file, name, grid.shape, np.float32, chunk=chunk) for name in of.units}
+        units = of.units | ({} if seen is None else {SEEN: "1"})
+        types = dict.fromkeys(of.units, np.float32) | {SEEN: np.uint16}
+        arrays = {name: room_for(file, name, grid.shape, types[name], chunk=chunk) for name in units}
         for name, array in arrays.items():
-            array.attrs.update({**attributes, "units": of.units[name]})
+            array.attrs.update({**attributes, "units": units[name]})
             for dimension, axis in zip(array.dims, "zyx"):
                 dimension.label = axis
         for start, part in slabs:
-            for name, values in of.of_volume(part).items():
+            counted = {} if seen is None else {SEEN: seen(part.grid)}
+            for name, values in (of.of_volume(part) | counted).items():
                 arrays[name][:, start : start + part.grid.shape[1]] = values
 
 
@@ -169,13 +183,14 @@ def write_voxels(
     grid: Grid,
     on_progress: Advance = lambda fraction: None,
     of: Contents = REFRACTION,
+    seen: ViewCount | None = None,
 ) -> None:
     """Write `obj` voxelised on `grid`, slab by slab; at most `SLAB_VOXELS` voxels are in memory, however large the
     grid.
 
-    `on_progress(fraction)` is called after each slab.
+    `on_progress(fraction)` is called after each slab. seen: as of `write_slabs`.
     """
-    write_slabs(path, grid, slabs_of(obj, grid, slab_rows(grid), on_progress), of)
+    write_slabs(path, grid, slabs_of(obj, grid, slab_rows(grid), on_progress), of, seen)
 
 
 def slab_rows(grid: Grid) -> int:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from ..backends import resolve
-from ..baselines.beyond import rows_of
+from ..baselines.beyond import margins_of
 from ..fit.density import DensityEvent
 from ..fit.loop import Fit, Plan
 from ..fit.optimiser import Adam
@@ -57,6 +57,7 @@ class Gaussians(GaussianOptions, Method):
 
     kind: ClassVar[str] = "gaussians"
     any_backend: ClassVar[bool] = True
+    two_sided: ClassVar[bool] = True
 
     def stages(self) -> tuple[Stage, ...]:
         """One: the start, and the fit."""
@@ -224,7 +225,7 @@ def gaussian_plan(
         schedule=schedule,
         optimiser=lambda leaves: Adam(leaves, backend),
         rates=lambda factor, step: options.rates.at(factor, step >= schedule.warmup_steps),
-        events=(DensityEvent(options.density, base.train.views.taller(rows_of(grid, scan.views))),),
+        events=(DensityEvent(options.density, base.train.views.padded(margins_of(grid, scan.views))),),
         judge=base.judge,
         grid=grid if options.objective.uses_volume else None,
     )

@@ -119,8 +119,13 @@ def prepared(task: Task, method: Method | None = None, before: Prepared | None =
     if method is not None:
         require(
             method.two_sided or not task.prior.two_sided,
-            f"matter on both sides of its medium is continuous, but the method is {method.kind}; take --method auto or "
-            "volume.",
+            f"matter on both sides of its medium is continuous, but the method is {method.kind}, whose matter lies on "
+            "one; take --method auto or volume.",
+        )
+        require(
+            task.prior.two_sided or not _volume_of(method).two_sided,
+            "volume.two_sided must be false, for --contrast says on which sides matter lies, but it is true; leave it, "
+            "or give --contrast both.",
         )
     first = first_of_task(task, _volume_of(method).backend)
     if before is None:

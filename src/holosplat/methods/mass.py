@@ -80,7 +80,7 @@ def total_delta(
     backend = found.backend
     beyond = rows_beyond(delta.clamp_min(0), train, material.beta / material.delta)
     taller = _indices(there, Grid.of_views(train.views.taller(beyond)), sign)[0] if beyond else delta
-    frames = WhitenedFrames(train, material, noise, backend=backend, beyond=beyond)
+    frames = WhitenedFrames(train, material, noise, backend=backend, beyond=(beyond, 0))
     problem = VolumeProblem(frames, ContinuousPrior(), 1.0, backend)
     ranges = Ranges(problem, predicted)
     limits = ranges.limits if ratio_doubt < DOUBTFUL else ranges.limits[-1:]

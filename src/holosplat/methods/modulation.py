@@ -152,8 +152,8 @@ class Ranges:
 
     def _inside(self, u: Tensor) -> Tensor:
         """The sum of a volume in the field of view."""
-        beyond = self.frames.beyond
-        return u[:, beyond : u.shape[1] - beyond].double().sum()
+        rows, columns = (slice(n, -n or None) for n in self.frames.beyond)
+        return u[columns, rows, columns].double().sum()
 
     def _left(self, now: Tensor) -> Tensor:
         """What amplitudes `now` leave of the measured ones."""

@@ -93,6 +93,7 @@ class NeuralFields(Method):
 
     kind: ClassVar[str] = "neural-field"
     any_backend: ClassVar[bool] = True
+    two_sided: ClassVar[bool] = True
 
     volume: HolographicTV = field(default_factory=HolographicTV)
     fit: NeuralFit = field(default_factory=NeuralFit)
@@ -139,9 +140,10 @@ def warmed_up(task: Task, matter: Matter, thickness: Tensor, options: NeuralFit)
         tuple(thickness.shape) == tuple(wanted),
         f"thickness must have the shape of the training frames {tuple(wanted)}, but it has {tuple(thickness.shape)}.",
     )
-    hull = grown(visual_hull(thickness, views, Grid.of_views(views), options.hull), options.margin)
+    two_sided = task.prior.two_sided
+    hull = grown(visual_hull(thickness, views, Grid.of_views(views), options.hull, two_sided), options.margin)
     upper = task.bound(1.0) if matter.single else 0.0
-    field = NeuralField(Grid.of_views(views), matter, options.network, hull, task.seed, upper)
+    field = NeuralField(Grid.of_views(views), matter, options.network, hull, task.seed, upper, lower=task.prior.lower)
     if options.warmup_steps == 0:
         return field
     fit = _warm_up(task.scan, field, (thickness / field.pitch).float(), options, task.seed)
@@ -228,13 +230,15 @@ class PruneEvent:
         self._field.look_at(state["mask"])
 
 
-def visual_hull(thickness: Tensor, views: Views, grid: Grid, share: float) -> Tensor:
+def visual_hull(thickness: Tensor, views: Views, grid: Grid, share: float, two_sided: bool = False) -> Tensor:
     """Voxels [Z, Y, X] of `grid` in front of pixels with matter in all views; a pixel's neighbours count with it.
 
     thickness: [V, H, W]; matter is what exceeds `share` of its largest value. Voxels that a view misses do not count.
+    two_sided: whether matter lies on both sides of its medium: it may cancel along a ray, and so no pixel is without.
     """
     level = share * float(np.quantile(thickness.cpu().numpy(), PEAK))
-    shown = max_pool2d((thickness > level)[:, None].float(), 3, stride=1, padding=1)[:, 0] > 0
+    matter = torch.ones_like(thickness, dtype=torch.bool) if two_sided else thickness > level
+    shown = max_pool2d(matter[:, None].float(), 3, stride=1, padding=1)[:, 0] > 0
     x, y, z = (torch.from_numpy(axis / views.pitch) for axis in grid.axes())
     hull = torch.ones(grid.shape, dtype=torch.bool)
     h, w = views.shape

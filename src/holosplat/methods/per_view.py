@@ -52,8 +52,9 @@ def svmbir_volume(
     *,
     options: Mbir = Mbir(),
     missing: Tensor | None = None,
+    two_sided: bool = False,
 ) -> Tensor:
-    """Occupancy [Z, Y, X] ≥ 0 on `grid` from thickness `lines` [V, H, W] in metres; float32.
+    """Occupancy [Z, Y, X] on `grid` from thickness `lines` [V, H, W] in metres; float32; ≥ 0 unless it is `two_sided`.
 
     qGGMRF prior, multi-resolution coordinate descent (Bouman & Sauer 1996; svmbir). The views must turn about y only
     and share one detector shift, the grid must be cubic, with the detector's rows and its middle on the rotation axis.
@@ -76,7 +77,7 @@ def svmbir_volume(
             sharpness=options.sharpness,
             p=options.p,
             T=options.T,
-            positivity=True,
+            positivity=not two_sided,
             max_iterations=options.iterations,
             stop_threshold=0.0,
             num_threads=options.threads,
@@ -121,6 +122,7 @@ class PerView(Method):
     """Phase retrieval of each view, then tomography, on voxels of one pixel; the occupancy of one material."""
 
     kind: ClassVar[str] = "per-view"
+    two_sided: ClassVar[bool] = True
 
     retrieval: str = "tikhonov"
     """Name of the phase retrieval."""
@@ -156,14 +158,15 @@ class PerViewStage:
         retrieve = RETRIEVALS[how.retrieval]
         frames = torch.from_numpy(scan.frames)
         report = task.report("phase retrieval")
-        thickness = retrieve(frames, scan.exposures, *material, missing=scan.gaps, on_progress=report)
+        known = {"missing": scan.gaps, "two_sided": task.prior.two_sided}
+        thickness = retrieve(frames, scan.exposures, *material, on_progress=report, **known)
         grid, report = Grid.of_views(scan.views), task.report(self.name)
         if how.tomography == SVMBIR:
-            values = svmbir_volume(thickness, scan.views, grid, report, missing=scan.gaps)
+            values = svmbir_volume(thickness, scan.views, grid, report, **known)
         else:
             upper = (task.bound(1.0) or None) if how.bounded else None
             tomography = TOMOGRAPHIES[how.tomography]
-            values = tomography(thickness, scan.views, grid, upper, report, missing=scan.gaps)
+            values = tomography(thickness, scan.views, grid, upper, report, **known)
         return VoxelGrid(values[None], grid, Matter.one(*material))
 
     def fit(self, task: Task, start: Stored) -> None:

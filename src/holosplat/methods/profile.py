@@ -17,7 +17,7 @@ from scipy.ndimage import binary_dilation, label
 from torch import Tensor
 
 from ..baselines import HolographicTV, holographic_tv
-from ..baselines.beyond import rows_of
+from ..baselines.beyond import margins_of
 from ..baselines.tomography import plateau
 from ..checks import at_least, require
 from ..fit.smooth_volume import ContinuousPrior, VolumeProblem, descend
@@ -109,11 +109,11 @@ class Profile:
         white = (noise.white.square() + options.doubt**2 * contrast).sqrt()
         self._noise = NoiseModel(white, noise.grain, noise.width)
         self._energy = self._scan.exposures.reference_energy
-        self._beyond = 0
+        self._beyond = (0, 0)
         self._samples = max(fringe_sampling(self._exposed(c).exposures) for c in [nominal, *corners])
         with memory_kept():
             whole = self._volume(self.frames(nominal))
-            self._beyond = rows_of(whole.grid, self._scan.views)
+            self._beyond = margins_of(whole.grid, self._scan.views)
             first = self._placed(whole)
         inside = without_specks(first, (first > options.faint * plateau(first)).numpy())
         self.support = torch.from_numpy(np.asarray(binary_dilation(inside, iterations=max(1, options.dilated))))
@@ -148,8 +148,8 @@ class Profile:
         return VoxelGrid(values[None], grid, Matter.one(*frames.material))
 
     def _placed(self, whole: VoxelGrid) -> Tensor:
-        """A volume with the rows beyond the frames that the first one has."""
-        return whole.resampled(Grid.of_views(self._scan.views.taller(self._beyond))).values[0]
+        """A volume with the rows and columns beyond the frames that the first one has."""
+        return whole.resampled(Grid.of_views(self._scan.views.padded(self._beyond))).values[0]
 
     def __call__(self, constants: Constants) -> float:
         """½ χ² and prior of the likeliest volume in the support."""

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ..backends import device, resolve
+from ..baselines.beyond import Margins, margins_of
 from ..baselines.tomography import plateau
 from ..fit.loop import DivergedError
 from ..fit.run import Record, interrupts_held
@@ -99,9 +100,9 @@ class SmoothPlan:
         return KnownLevels(self.known, self.begun.matter.channels[0])
 
     @property
-    def beyond(self) -> int:
-        """Rows above and below the frames in which the start has matter."""
-        return (self.begun.grid.shape[1] - self.scan.views.shape[0]) // 2
+    def beyond(self) -> Margins:
+        """Rows above and below the frames, and columns at either side, in which the start has matter."""
+        return margins_of(self.begun.grid, self.scan.views)
 
     def legs(self) -> tuple[Leg, ...]:
         """All descents: rounds on larger voxels, the choice of the likelier volume, and rounds on those of a pixel."""
@@ -118,7 +119,8 @@ class SmoothPlan:
         """The frames on pixels `factor` times larger, in units of their noise."""
         noise, material = self.noise.binned(factor), self.begun.matter.channels[0]
         light = self.light and self.light.part(torch.arange(len(self.scan)), factor)
-        how = {"backend": self.backend, "beyond": self.beyond // factor}
+        rows, columns = (n // factor for n in self.beyond)
+        how = {"backend": self.backend, "beyond": (rows, columns)}
         return WhitenedFrames(self.scan.binned(factor), material, noise, **how, doubt=light)
 
 

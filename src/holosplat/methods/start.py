@@ -53,6 +53,10 @@ def starting_cloud(task: Task, options: GaussianOptions) -> GaussianCloud:
         f"Gaussians are of {MOST_CHANNELS} materials at most, but {len(task.prior.materials)} are known; give fewer, "
         "or --method auto where frames show their surfaces.",
     )
+    require(
+        not (options.separate and task.prior.two_sided and not task.prior.fixes_ratio),
+        "Gaussians with δ and β apart lie on one side of their medium, but matter lies on both; leave separate = true.",
+    )
     return (_random if options.start == "random" else _from_phase_retrieval)(task, options)
 
 
@@ -68,19 +72,35 @@ def cloud_of(volume: Tensor, grid: Grid, material: DeltaBeta, task: Task, option
 def _from_phase_retrieval(task: Task, options: GaussianOptions) -> GaussianCloud:
     scan, backend = task.scan, options.volume.backend
     material = material_of_levels(task, backend, options.estimate)
-    how = replace(options.volume, upper=options.volume.upper if task.bounded else 0.0)
+    upper = options.volume.upper if task.bounded else 0.0
+    how = replace(options.volume, upper=upper, two_sided=task.prior.two_sided)
 
     def retrieve(frames: Scan) -> tuple[Tensor, Grid]:
         return holographic_tv(frames, material, how, task.on_progress, task.unlike_null)
 
     volume, grid = retrieve(scan)
-    shares = _shares(task, options, material, (volume, grid), retrieve)
+    if task.prior.two_sided:
+        shares = _sides(volume, grid, material, options.filled)
+    else:
+        shares = _shares(task, options, material, (volume, grid), retrieve)
     if shares is None:
         return cloud_of(volume, grid, material, task, options)
     pitch, (volume, grid) = scan.views.finest, (shares.values, shares.grid)
     whole, spacing = at_pitch(volume, grid, pitch), _spacing_px(scan, options) * pitch
     cloud = cloud_from_shares(*whole, shares.materials, spacing, pitch, options.max_start, options.filled)
     return _approximate(cloud, volume, grid, task, options)
+
+
+def both_sides(material: DeltaBeta) -> tuple[DeltaBeta, DeltaBeta]:
+    """`material`, and what lies as far on the other side of its medium: together, amplitudes of any sign."""
+    return material, DeltaBeta(-material.delta, -material.beta)
+
+
+def _sides(volume: Tensor, grid: Grid, material: DeltaBeta, filled: float) -> Shares:
+    """Matter [Z, Y, X] in units of `material` as that of each side of its medium; a side without any is left out."""
+    sides = list(zip((volume, -volume), both_sides(material)))
+    values, materials = zip(*([side for side in sides if float(side[0].max()) > filled] or sides[:1]))
+    return Shares(torch.stack(values).clamp_min(0), grid, materials)
 
 
 def _approximate(
@@ -143,6 +163,8 @@ def _random(task: Task, options: GaussianOptions) -> GaussianCloud:
     matter = Matter.one(*material) if prior.fixes_ratio else Matter.free(*material)
     if len(prior.materials) == 2:
         matter = Matter.several(*prior.materials)
+    if prior.two_sided:
+        matter = Matter.several(*both_sides(material))
     return random_cloud(options.random_count, scan.views, matter, thickness, task.seed)
 
 

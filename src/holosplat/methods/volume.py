@@ -9,7 +9,7 @@ import torch
 
 from ..backends import Backend
 from ..baselines import HolographicTV, holographic_tv
-from ..baselines.beyond import rows_of
+from ..baselines.beyond import margins_of
 from ..baselines.material import MaterialEstimate
 from ..checks import at_least, require
 from ..fit.smooth_volume import ContinuousPrior
@@ -107,7 +107,7 @@ class SmoothStage:
         material = assumed_material(scan, task.prior, task.on_progress, backend, options.estimate)
         how = replace(options.volume, upper=0.0, two_sided=task.prior.two_sided)
         first, grid = holographic_tv(scan, material, how, task.on_progress, light)
-        field = scan.views.taller(rows_of(grid, scan.views))
+        field = scan.views.padded(margins_of(grid, scan.views))
         return VoxelGrid(first[None], grid, Matter.one(*material)).resampled(Grid.of_views(field))
 
     def fit(self, task: Task, start: Stored) -> SmoothFit:
@@ -117,7 +117,7 @@ class SmoothStage:
         noise, backend = task.noise.binned(factor), options.volume.backend
         scan = _beside(task, start).binned(factor)
         light = task.uneven and task.uneven.part(torch.arange(len(scan)), factor)
-        if rows_of(start.grid, scan.views):
+        if any(margins_of(start.grid, scan.views)):
             least = LEFT * contrast_level(scan.measured)
             noise, light = noise.at_least(least), light and replace(light, noise=light.noise.at_least(least))
         two_sided = task.prior.two_sided

@@ -9,7 +9,7 @@ from typing import ClassVar
 import torch
 
 from ..baselines import HolographicTV, holographic_tv
-from ..baselines.beyond import rows_of
+from ..baselines.beyond import margins_of
 from ..checks import at_least, require
 from ..fit.loop import Fit, Plan
 from ..fit.optimiser import Leaves
@@ -40,6 +40,7 @@ class HolographicVoxels(Method):
 
     kind: ClassVar[str] = "holographic-tv"
     any_backend: ClassVar[bool] = True
+    two_sided: ClassVar[bool] = True
 
     volume: HolographicTV = field(default_factory=HolographicTV)
 
@@ -58,7 +59,7 @@ class HolographicStage:
     def start(self, task: Task, before: Stored | None) -> VoxelGrid:
         """Occupancies of the one material that all matter is taken for."""
         material = assumed_material(task.scan, task.prior, task.on_progress, self.options.backend)
-        bounded = replace(self.options, upper=task.bound(1.0))
+        bounded = replace(self.options, upper=task.bound(1.0), two_sided=task.prior.two_sided)
         values, grid = holographic_tv(task.scan, material, bounded, task.on_progress, task.unlike_null)
         return VoxelGrid(values[None], grid, Matter.one(*material))
 
@@ -121,6 +122,7 @@ class Voxels(Method):
     """
 
     kind: ClassVar[str] = "voxels"
+    two_sided: ClassVar[bool] = True
 
     volume: HolographicTV = field(default_factory=HolographicTV)
     fit: VoxelFit = field(default_factory=VoxelFit)
@@ -153,7 +155,7 @@ class VoxelStage:
         free = before.matter.single and not task.prior.fixes_ratio
         refine = 1 if self.coarse else refinement(task.scan, self.options)
         grid = (before.freed() if free else before).resampled(
-            Grid.of_views(task.scan.views.taller(rows_of(before.grid, task.scan.views)), refine)
+            Grid.of_views(task.scan.views.padded(margins_of(before.grid, task.scan.views)), refine)
         )
         return grid.with_parameters({"values": grid.values.detach().float()})
 
@@ -162,7 +164,8 @@ class VoxelStage:
         assert isinstance(start, VoxelGrid)
         options = replace(self.options, upper=task.bound(self.options.upper) if start.matter.single else 0.0)
         steps = self.options.coarse_steps if self.coarse else self.options.steps
-        return voxel_fit(task.scan, start, replace(options, steps=steps), task.seed, task.uneven)
+        how = replace(options, steps=steps)
+        return voxel_fit(task.scan, start, how, task.seed, task.uneven, lower=task.prior.lower)
 
 
 def voxel_fit(
@@ -171,11 +174,13 @@ def voxel_fit(
     options: VoxelFit,
     seed: int = 0,
     light: Light | None = None,
+    *,
+    lower: float = 0.0,
 ) -> Fit:
     """The fit of `start`, on its own grid, to the training frames of `scan`, made ready.
 
     Minimised is `mean over views of the misfit + λ/(k² V) Σ |∇u|`, k voxels a pixel and V views, so that λ does not
-    depend on either.
+    depend on either. lower: bound of the values from below.
     """
     refine = max(1, round(scan.views.finest / start.grid.voxel_size[0]))
     schedule = replace(options.schedule, steps=options.steps)
@@ -185,7 +190,7 @@ def voxel_fit(
     upper = options.upper if options.upper and start.matter.single else float("inf")
 
     def optimiser(leaves: Leaves) -> ProjectedGradient:
-        return ProjectedGradient(leaves, upper, scale)
+        return ProjectedGradient(leaves, upper, scale, lower)
 
     terms = (base.frames, VoxelVariation(weight, options.smoothing), *base.extra(options.terms))
     plan = Plan(Problem(base.model, terms), schedule, optimiser, judge=base.judge)

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from ..geometry import Grid
 from ..scan import Exposures
 from ..units import wavelength
 from .propagation import fresnel_reach_px
@@ -56,6 +57,22 @@ def fringe_sampling(exposures: Exposures, extra: int = 0) -> int:
 def fringes(exposures: Exposures) -> np.ndarray:
     """Widths √(λz) [V] of the first fringes [m]; 0 in contact."""
     return np.sqrt(wavelength(exposures.energy_kev) * exposures.distance)
+
+
+def views_seeing(exposures: Exposures, grid: Grid) -> np.ndarray:
+    """The number of views that show each voxel, [Z, Y, X] uint16 on `grid`.
+
+    A view shows a voxel if the projection of its centre lies on the frame, and the first fringe around it does, too.
+    """
+    views, (x, y, z) = exposures.views, grid.axes()
+    half = 0.5 * views.fields - fringes(exposures)[:, None]
+    found = np.zeros(grid.shape, dtype=np.uint16)
+    rows = y[:1] if views.shares_axis else y  # all rows then have the same columns
+    for rotation, shift, (width, height) in zip(views.rotations, views.shifts, half):
+        column, row = (a[0] * x + a[1] * rows[:, None] + a[2] * z[:, None, None] - s for a, s in zip(rotation, shift))
+        row = y[:, None] - shift[1] if views.shares_axis else row
+        found += (np.abs(column) <= width) & (np.abs(row) <= height)
+    return found
 
 
 def resolving_oversample(exposures: Exposures, samples_per_fringe: float, at_least: int) -> int:

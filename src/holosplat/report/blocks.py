@@ -209,7 +209,7 @@ def _ends(values: np.ndarray) -> tuple[float, float]:
 def _slices(content: ReportContent) -> Block:
     truth, delta, shown = content.truth, content.reconstruction.delta, content.quantity
     planes = richest_planes(content.reconstruction if truth is None else truth)
-    figure = slices_figure(content.reconstruction, truth, planes, shown)
+    figure = slices_figure(content.reconstruction, truth, planes, shown, seen=content.seen)
     low, high = (shown.text(end) for end in _ends(delta))
     text = (
         f"{shown.symbol} in the three orthogonal planes that hold most matter. "
@@ -223,7 +223,7 @@ def _slices(content: ReportContent) -> Block:
             f", the truth's from {low} to {high}. "
             "Truth and reconstruction share one colour scale; differences are reconstruction − truth."
         )
-    return drawn_block("Slices", text, f"Slices of {shown.symbol}.", figure)
+    return drawn_block("Slices", f"{text} {content.trust}".rstrip(), f"Slices of {shown.symbol}.", figure)
 
 
 def _correlation(content: ReportContent) -> Block:

@@ -14,7 +14,7 @@ from ..geometry import Grid, Views
 from ..inference import Decision
 from ..metrics import ImageScores, VolumeScores, require_same_grid, robust_material_delta
 from ..representations import MovingSurfaces
-from ..units import wavenumber
+from ..units import in_percent, wavenumber
 from ..volume import Volume
 from ..workflows.totals import TotalMatter
 from ..workflows.verdict import Verdict
@@ -213,6 +213,7 @@ class ReportContent:
     - energy_kev: at which δ and β hold [keV]; pixel_size: of the frames [m],
       the smallest where they differ
     - held_out: test views; projections: line integrals of a few views; volume_scores: against the truth
+    - seen: voxels of these volumes [Z, Y, X] bool that all training views show; None: all of them
     - material_delta: the material's δ, for surfaces and masks; None: the robust maximum of the truth, or else
       of the reconstruction
     - lit: training frames in uneven light; None: the light is even
@@ -240,6 +241,7 @@ class ReportContent:
     held_out: HeldOutViews | None = None
     projections: ProjectedMaps | None = None
     volume_scores: VolumeScores | None = None
+    seen: np.ndarray | None = None
     material_delta: float | None = None
     explained: Verdict | None = None
     delta_told: bool = True
@@ -269,6 +271,18 @@ class ReportContent:
             require_same_grid(self.reconstruction.grid, self.truth.grid)
         lengths = {name: len(column) for name, column in self.history.items()}
         require(len(set(lengths.values())) <= 1, f"history columns must have one length, but have {lengths}.")
+
+    @property
+    def trust(self) -> str:
+        """Where all views show the volume, and how much matter lies elsewhere; nothing where they show all of it."""
+        size = np.abs(self.reconstruction.delta)
+        if self.seen is None or self.seen.all() or not size.any():
+            return ""
+        share = float(size[~self.seen].sum(dtype=np.float64) / size.sum(dtype=np.float64))
+        return (
+            "Inside the dashed line all training views show the matter and its first fringe. Beyond it lies "
+            f"{in_percent(share)} of the matter; trust its values less."
+        )
 
     @property
     def quantity(self) -> Quantity:

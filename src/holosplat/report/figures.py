@@ -200,9 +200,10 @@ def slices_figure(
     positions: tuple[int, int, int],
     quantity: Quantity = DELTA,
     names: tuple[str, str] = ("Truth", "Reconstruction"),
+    seen: np.ndarray | None = None,
 ) -> Figure:
     """δ, or µ, in three orthogonal planes at voxel `positions` (z, y, x): truth,
-    reconstruction and difference; names: of these two."""
+    reconstruction and difference; names: of these two. seen: voxels [Z, Y, X] bool that a dashed line encloses."""
     volumes = [(name, v.delta) for name, v in zip(names, (truth, reconstruction)) if v is not None]
     scale, power = decimal_scale(quantity.factor * max(float(np.abs(v).max()) for _, v in volumes))
     scale /= quantity.factor
@@ -211,14 +212,14 @@ def slices_figure(
     widths, heights = plane_sizes(reconstruction.grid)
     panels = PanelGrid(1 if truth is None else 3, widths, heights, (2,))
     for row, (name, values) in enumerate(volumes):
-        drawn = slice_row(panels.axes[row], values / scale, reconstruction.grid, positions, colours, limits)
+        drawn = slice_row(panels.axes[row], values / scale, reconstruction.grid, positions, colours, limits, seen)
         slice_titles(panels.axes[row], 3 * row, name, reconstruction.grid, positions)
     label = quantity.label(power)
     panels.bar(drawn, 2, (0, len(volumes) - 1), label)
     if truth is not None:
         difference = (reconstruction.delta - truth.delta) / scale
         limit = largest(difference, 99.9)
-        drawn = slice_row(panels.axes[2], difference, truth.grid, positions, SIGNED_MAP, (-limit, limit))
+        drawn = slice_row(panels.axes[2], difference, truth.grid, positions, SIGNED_MAP, (-limit, limit), seen)
         slice_titles(panels.axes[2], 6, "Difference", truth.grid, positions)
         panels.bar(drawn, 2, (2, 2), f"difference of {label}", "both")
     return panels.figure
@@ -249,14 +250,21 @@ def slice_row(
     positions: tuple[int, int, int],
     colours: str,
     limits: tuple[float, float],
+    seen: np.ndarray | None = None,
 ) -> AxesImage:
-    """Draw the three orthogonal planes of `values` [Z, Y, X] at voxel `positions` (z, y, x)."""
+    """Draw the three orthogonal planes of `values` [Z, Y, X] at voxel `positions` (z, y, x), and what encloses those
+    that are `seen` [Z, Y, X] bool."""
     edge = dict(zip("xyz", grid.voxel_size))
     widths, _ = plane_sizes(grid)
     for panel, (_, axis, (across, down)), width in zip(axes, PLANES, widths):
         plane = _slice(values, axis, positions[axis])
         drawn = image_panel(panel, plane, (edge[across], edge[down]), colours, limits)
-        scale_bar(panel, width, "white" if colours != SIGNED_MAP else "black")
+        ink = "white" if colours != SIGNED_MAP else "black"
+        scale_bar(panel, width, ink)
+        if seen is not None and len(np.unique(inside := _slice(seen, axis, positions[axis]))) > 1:
+            i, j = ((np.arange(n) + 0.5) * edge[name] for n, name in zip(inside.shape, (down, across)))
+            panel.autoscale(False)
+            panel.contour(j, i, inside, levels=[0.5], colors=ink, linewidths=0.7, linestyles="dashed")
     return drawn
 
 

@@ -18,6 +18,7 @@ from ..io.volumes import read_guess
 from ..methods import METHODS, learned
 from ..motion.measures import columns, measured
 from ..optics.background import Light
+from ..optics.sampling import views_seeing
 from ..projectors.voxels import voxel_line_integrals
 from ..representations import MovingSurfaces, Stored
 from ..scan import Scan
@@ -74,7 +75,7 @@ def report_run(
             test.views.pixel_sizes,
             evaluation.verdict,
         )
-    volume = found.voxelise(grid)
+    volume, train = found.voxelise(grid), scan.train()
     if truth is not None and not reconstruction.delta_told:
         truth = of_absorption(truth)
     with as_written(folder.config, "of a run that has begun"):
@@ -96,6 +97,7 @@ def report_run(
         held_out=held_out,
         projections=_projections(found, scan.views, truth),
         volume_scores=evaluation.volume,
+        seen=views_seeing(train.exposures, grid) == len(train),
         material_delta=found.matter.delta if found.matter.single else None,
         explained=reconstruction.verdict,
         delta_told=reconstruction.delta_told,

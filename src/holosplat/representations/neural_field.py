@@ -91,9 +91,11 @@ class NeuralField:
     """A field of matter on the box of `grid` (cubic voxels), zero where `mask` [Z, Y, X] says that nothing is.
 
     upper: the largest occupancy of a single material, `upper · sigmoid` of the network's output (0: its softplus,
-    without a bound); two channels have no bound. Line integrals are sums over samples a voxel edge apart, on rays a
-    voxel edge apart; linear between rays on finer rasters. Works in any float type, on any device. jitter: a generator
-    that draws where in its depth step each sample lies while gradients are taken (None: in the middle).
+    without a bound); two channels have no bound. lower: the smallest value, 0, or -inf, for which values are the
+    network's output itself, for matter on both sides of its medium. Line integrals are sums over samples a voxel edge
+    apart, on rays a voxel edge apart; linear between rays on finer rasters. Works in any float type, on any device.
+    jitter: a generator that draws where in its depth step each sample lies while gradients are taken (None: in the
+    middle).
     """
 
     kind: ClassVar[str] = "neural-field"
@@ -103,17 +105,29 @@ class NeuralField:
     _repr_html_ = of_object
 
     def __init__(
-        self, grid: Grid, matter: Matter, network: Network, mask: Tensor, seed: int = 0, upper: float = 1.0
+        self,
+        grid: Grid,
+        matter: Matter,
+        network: Network,
+        mask: Tensor,
+        seed: int = 0,
+        upper: float = 1.0,
+        *,
+        lower: float = 0.0,
     ) -> None:
         require(np.allclose(grid.voxel_size, grid.voxel_size[0]), "a neural field needs a grid of cubic voxels.")
         shape = tuple(mask.shape)
         require(shape == grid.shape, f"the mask must have the grid's shape {grid.shape}, but it has {shape}.")
         require(matter.delta != 0, "a neural field needs matter with a δ, but it is 0.")
         require(upper >= 0, f"upper must not be negative, but it is {upper:g}.")
-        self.grid, self.matter, self.network, self.upper = grid, matter, network, float(upper)
+        require(lower in (0, -math.inf), f"lower must be 0 or -inf, but it is {lower:g}.")
+        require(lower == 0 or upper == 0, f"a field without a lower bound has no upper one, but upper is {upper:g}.")
+        self.grid, self.matter, self.network, self.upper, self.lower = grid, matter, network, float(upper), float(lower)
         self.pitch, self.backend = grid.voxel_size[0], "cpu"
         self.jitter: torch.Generator | None = None
         self._net = Perceptron(network, float(max(grid.shape)), len(matter) + self.beside, seed)
+        if lower < 0:
+            self._net.output.bias.detach().zero_()  # no matter, where values are the network's output
         self._weights = {name: weight.detach() for name, weight in self._net.named_parameters()}
         self._constants = dict(self._net.named_buffers())
         self.corner = torch.tensor([o - 0.5 * self.pitch for o in grid.origin], dtype=torch.float64) / self.pitch
@@ -154,6 +168,7 @@ class NeuralField:
             "origin": list(self.grid.origin),
             "network": to_table(self.network),
             "upper": self.upper,
+            "lower": self.lower,
             "constants": self._constants,
             "matter": self.matter.as_dict(),
         }
@@ -164,7 +179,8 @@ class NeuralField:
         size, origin = (tuple(float(v) for v in state[name]) for name in ("voxel_size", "origin"))
         grid = Grid(tuple(state["mask"].shape), size, origin)  # type: ignore[arg-type]
         network = from_table(Network, state["network"], "network")
-        field = cls(grid, Matter.from_dict(state["matter"]), network, state["mask"], upper=float(state["upper"]))
+        lowest = {"lower": float(state.get("lower", 0.0))}  # runs before matter of both sides have none
+        field = cls(grid, Matter.from_dict(state["matter"]), network, state["mask"], 0, float(state["upper"]), **lowest)
         for name, mine in (("weights", field._weights), ("constants", field._constants)):
             _require_shapes(name, state.get(name, {}), mine)
         field._constants = dict(state.get("constants", {}))
@@ -192,6 +208,8 @@ class NeuralField:
     def __call__(self, positions: Tensor) -> Tensor:
         """Values [N, C] at positions [N, 3] `(x, y, z)` in voxel edges from the box's corner, mask or not."""
         raw = self.raw(positions)
+        if self.lower < 0:
+            return raw
         return self.upper * torch.sigmoid(raw) if self.matter.single and self.upper > 0 else softplus(raw)
 
     def raw(self, positions: Tensor) -> Tensor:
@@ -315,11 +333,11 @@ class NeuralField:
 
     @torch.no_grad()
     def prune(self, threshold: float, grow: int, within: Tensor) -> None:
-        """The mask becomes what exceeds `threshold` in δ's channel, grown by `grow` voxels, inside `within` [Z, Y, X].
+        """The mask becomes what exceeds `threshold` in size in δ's channel, grown by `grow` voxels, inside `within`.
 
         It stays as it is if nothing exceeds the threshold: a field can start from less.
         """
-        kept = grown(self.values(self.grid)[0] > threshold, grow) & within
+        kept = grown(self.values(self.grid)[0].abs() > threshold, grow) & within
         if bool(kept.any()):
             self.look_at(kept)
 

@@ -34,11 +34,13 @@ class Retrieval(Protocol):
         beta: float,
         *,
         missing: Tensor | None = None,
+        two_sided: bool = False,
         on_progress: Advance = lambda fraction: None,
     ) -> Tensor:
         """Thickness [V, H, W] in metres of one material (δ and β of any sign) from relative intensities [V, H, W].
 
         missing: pixels [V, H, W] bool without a value of their own (None: there are none); they have no weight.
+        two_sided: whether the thickness may be negative, of matter on both sides of its medium; filters need no word.
         Of holes in a medium, whose δ against it is negative, it is theirs. The result has the frames' type, float32 or
         float64. `InputError` for frames that do not match `exposures` or are not finite, or δ = 0.
         """

@@ -39,21 +39,22 @@ def admm(
     *,
     options: ADMM = ADMM(),
     missing: Tensor | None = None,
+    two_sided: bool = False,
     on_progress: Advance = lambda fraction: None,
 ) -> Tensor:
     """Thickness [V, H, W] in metres of one material, β of any sign, with edges: frames [V, H, W] through full waves.
 
-    `½ Σ (√I(φ) - √I)² + w TV(φ)` over phases φ = k|δ|T that are not negative and lie within a support, split as by
-    Goldstein & Osher (2009): slopes d = ∇φ are shrunk, a copy z = φ is bounded, and φ takes one damped Newton step,
-    which is diagonal in Fourier space. Wen et al. (2012) split at the detector instead, where the amplitude has an
-    exact proximal map; but point-spread function and pixel stand between wave and amplitude there, and the phase of
-    a wave of its own may wrap. Villanueva-Perez et al. (2017) split the linear model; this is theirs, with the wave
-    optics in its place and total variation beside the bounds.
+    `½ Σ (√I(φ) - √I)² + w TV(φ)` over phases φ = k|δ|T that are not negative (unless `two_sided`) and lie within a
+    support, split as by Goldstein & Osher (2009): slopes d = ∇φ are shrunk, a copy z = φ is bounded, and φ takes one
+    damped Newton step, which is diagonal in Fourier space. Wen et al. (2012) split at the detector instead, where the
+    amplitude has an exact proximal map; but point-spread function and pixel stand between wave and amplitude there, and
+    the phase of a wave of its own may wrap. Villanueva-Perez et al. (2017) split the linear model; this is theirs, with
+    the wave optics in its place and total variation beside the bounds.
     """
 
     def solve(frames: Tensor, exposures: Exposures, noise: Noise, missing: Gaps, on_progress: Advance) -> Tensor:
         how = (options.backend, options.leaves, options.prior)
-        told = {"sign": math.copysign(1.0, delta), "missing": missing, "two_sided": options.two_sided}
+        told = {"sign": math.copysign(1.0, delta), "missing": missing, "two_sided": two_sided}
         model = WaveModel(frames, exposures, beta / delta, noise, *how, **told)
         return model.thickness(_alternate(model, options, on_progress), delta)
 

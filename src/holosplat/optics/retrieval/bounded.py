@@ -30,6 +30,11 @@ FIXED = Prior(corner=6.0, decay=1.5)
 lowest frequencies; or it is what a volume lacks, which is flatter than matter. Networks learned with it."""
 
 
+Leaves = tuple[bool, bool]
+"""Whether matter goes on above and below the frames, and at their sides."""
+NOWHERE: Leaves = (False, False)
+
+
 @dataclass(frozen=True)
 class Estimate:
     """phase: delay (of holes: advance) [V, H, W] in radians, not negative unless matter is two-sided, float64; support:
@@ -44,7 +49,7 @@ def bounded_estimate(
     exposures: Exposures,
     ratio: float,
     noise: Noise,
-    leaves: bool = False,
+    leaves: Leaves = NOWHERE,
     prior: Prior | None = None,
     sign: float = 1.0,
     *,
@@ -59,13 +64,13 @@ def bounded_estimate(
     matter (a support found anew in every round: the "shrinkwrap" of Marchesini et al. 2003).
 
     missing: pixels [V, H, W] bool without a value (`completed`). two_sided: whether phases may be negative.
-    leaves: whether matter goes on above and below the frame. Air there would take a soft body away far into the frame,
-    for only the bends of its shadow are seen; it may then go on, and ends as smoothly as it can. prior: expected power
-    (default: the one that the frames show, or `FIXED` where matter leaves them).
+    leaves: whether matter goes on above and below the frame, and at its sides. Air there would take a soft body away
+    far into the frame, for only the bends of its shadow are seen; it may then go on, and ends as smoothly as it can.
+    prior: expected power (default: the one that the frames show, or `FIXED` where matter leaves them).
     """
     contrast, crop = surrounded(frames, exposures)
     raster = Raster((contrast.shape[-2], contrast.shape[-1]), exposures.views.pixel_size)
-    h, prior = response(exposures, ratio, raster), prior or (FIXED if leaves else None)
+    h, prior = response(exposures, ratio, raster), prior or (FIXED if any(leaves) else None)
     known = spectra(frames, exposures, h, raster, noise, MODEL_ERROR, prior, leaks=prior is None, missing=missing)
     trusted = 1 - known.inverse * known.response
     if noise is None:
@@ -75,13 +80,13 @@ def bounded_estimate(
     least = (SIGNIFICANT * doubtful)[:, None, None]
     linear = -sign * filtered(completed(contrast, missing, crop, known), known.inverse)
     inside = torch.zeros_like(linear[:1])
-    inside[:, slice(None) if leaves else crop[1], crop[2]] = 1
+    inside[:, *(slice(None) if on else part for on, part in zip(leaves, crop[1:]))] = 1
     phase = linear
 
     def matter_of(phase: Tensor) -> Tensor:
         return phase * ((phase.abs() if two_sided else phase) > least)
 
-    for _ in range(LEAVING_STEPS if leaves else STEPS):
+    for _ in range(LEAVING_STEPS if any(leaves) else STEPS):
         matter = matter_of(phase) * inside
         phase = linear + filtered(matter, trusted)
     matter = matter_of(phase)[crop]

@@ -48,19 +48,20 @@ def gerchberg_saxton(
     *,
     options: Projections = Projections(),
     missing: Tensor | None = None,
+    two_sided: bool = False,
     on_progress: Advance = lambda fraction: None,
 ) -> Tensor:
     """Thickness [V, H, W] in metres of one material, β of any sign, by alternating projections.
 
     Gerchberg & Saxton (1972), or Fienup's (1982) error reduction: the wave in the detector plane takes the measured
-    amplitude, the wave behind the object becomes `exp(-(kβ + ikδ) T)` with T ≥ 0, zero outside the support of
-    `bounded_estimate`, from which it starts. Frequencies around the zeros of the response stay as they were.
+    amplitude, the wave behind the object becomes `exp(-(kβ + ikδ) T)` with T ≥ 0 (unless `two_sided`), zero outside the
+    support of `bounded_estimate`, from which it starts. Frequencies around the zeros of the response stay as they were.
     """
 
     def reduce(_: Tensor, projected: Tensor, model: WaveModel) -> Tensor:
         return model.bounded(projected)
 
-    return _alternate(frames, exposures, (delta, beta), options, reduce, (missing, on_progress))
+    return _alternate(frames, exposures, (delta, beta), options, reduce, (missing, two_sided, on_progress))
 
 
 @or_in_contact
@@ -72,19 +73,21 @@ def hybrid_input_output(
     *,
     options: Projections = Projections(),
     missing: Tensor | None = None,
+    two_sided: bool = False,
     on_progress: Advance = lambda fraction: None,
 ) -> Tensor:
     """Thickness [V, H, W] in metres of one material, β of any sign, by Fienup's (1982) hybrid input–output.
 
-    As `gerchberg_saxton`, but where the phase φ' after the detector's projection is negative or outside the support,
-    the next input is `φ - 0.9 φ'`: pushed away from the violation, not set to zero. The last iterate is bounded.
+    As `gerchberg_saxton`, but where the phase φ' after the detector's projection is negative (unless `two_sided`) or
+    outside the support, the next input is `φ - 0.9 φ'`: pushed away from the violation, not set to zero. The last
+    iterate is bounded.
     """
 
     def push(before: Tensor, projected: Tensor, model: WaveModel) -> Tensor:
-        allowed = (projected >= 0) & (model.support > 0)
+        allowed = (projected >= model.least) & (model.support > 0)
         return torch.where(allowed, projected, before - options.feedback * projected)
 
-    return _alternate(frames, exposures, (delta, beta), options, push, (missing, on_progress))
+    return _alternate(frames, exposures, (delta, beta), options, push, (missing, two_sided, on_progress))
 
 
 def _alternate(
@@ -93,14 +96,13 @@ def _alternate(
     material: tuple[float, float],
     options: Projections,
     rule: Callable[[Tensor, Tensor, WaveModel], Tensor],
-    beside: tuple[Gaps, Advance],
+    beside: tuple[Gaps, bool, Advance],
 ) -> Tensor:
-    (delta, beta), (missing, on_progress) = material, beside
+    (delta, beta), (missing, two_sided, on_progress) = material, beside
 
     def solve(frames: Tensor, exposures: Exposures, noise: Noise, missing: Gaps, on_progress: Advance) -> Tensor:
-        model = WaveModel(
-            frames, exposures, beta / delta, noise, options.backend, sign=math.copysign(1.0, delta), missing=missing
-        )
+        told = {"sign": math.copysign(1.0, delta), "missing": missing, "two_sided": two_sided}
+        model = WaveModel(frames, exposures, beta / delta, noise, options.backend, **told)
         phase = model.phase
         for done in range(options.iterations):
             on_progress(done / options.iterations)

@@ -69,6 +69,7 @@ def paganin(
     *,
     options: Linear = Linear(),
     missing: Tensor | None = None,
+    two_sided: bool = False,
     on_progress: Advance = lambda fraction: None,
 ) -> Tensor:
     """Thickness [V, H, W] in metres of one material by the filter of Paganin et al. (2002), eq. 12.
@@ -79,7 +80,7 @@ def paganin(
     solved by `contrast_transfer`.
     """
     if beta / delta < WEAKEST_ABSORPTION and options.noise != 0:
-        how = {"options": options, "missing": missing, "on_progress": on_progress}
+        how = {"options": options, "missing": missing, "two_sided": two_sided, "on_progress": on_progress}
         return contrast_transfer(frames, exposures, delta, beta, **how)
     frames = checked(frames, exposures, delta)
     on_progress(0.0)
@@ -106,6 +107,7 @@ def contrast_transfer(
     *,
     options: Linear = Linear(),
     missing: Tensor | None = None,
+    two_sided: bool = False,
     on_progress: Advance = lambda fraction: None,
 ) -> Tensor:
     """Thickness [V, H, W] in metres of one material, β of any sign, by its contrast transfer function.

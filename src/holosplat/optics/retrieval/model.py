@@ -18,7 +18,7 @@ from ...scan import Exposures
 from ...units import wavelength
 from ..hologram import hologram, optical_path
 from ..sampling import alike, fringe_sampling, padding
-from .bounded import FIXED, MODEL_ERROR, Estimate, bounded_estimate
+from .bounded import FIXED, MODEL_ERROR, NOWHERE, Estimate, Leaves, bounded_estimate
 from .spectra import (
     Gaps,
     Noise,
@@ -58,12 +58,10 @@ class Regularised:
     """Standard deviation of the frames, or their noise model (default: estimated from them)."""
     backend: str = "cpu"
     """Implementation of the wave optics (see `backends`)."""
-    leaves: bool = False
-    """Whether matter goes on above and below the frames (`bounded_estimate`)."""
+    leaves: Leaves = NOWHERE
+    """Whether matter goes on above and below the frames, and at their sides (`bounded_estimate`)."""
     prior: Prior | None = None
     """Expected power of the phase (default: the one that the frames show)."""
-    two_sided: bool = False
-    """Whether phases may be negative, of matter on both sides of its medium."""
 
     def __post_init__(self) -> None:
         at_least(self, 1, "iterations")
@@ -90,7 +88,7 @@ class WaveModel:
         ratio: float,
         noise: Noise,
         backend: str = "cpu",
-        leaves: bool = False,
+        leaves: Leaves = NOWHERE,
         prior: Prior | None = None,
         *,
         sign: float = 1.0,
@@ -99,7 +97,7 @@ class WaveModel:
     ) -> None:
         told = {"missing": missing, "two_sided": two_sided}
         estimate = bounded_estimate(frames, exposures, ratio, noise, leaves, prior, sign, **told)
-        self.sign, self._least = sign, -math.inf if two_sided else 0.0
+        self.sign, self.least = sign, -math.inf if two_sided else 0.0
         energy = exposures.one_energy("the wave model of a phase retrieval")
         self.exposures, self.ratio = exposures, float(absorption(exposures, ratio)[0])
         self.backend = resolve("reference" if frames.dtype == torch.float64 else backend)
@@ -120,7 +118,7 @@ class WaveModel:
             (exposures.views.shape, (my, mx), self.oversample),
             frames.dtype,
         ).to(self.frames.device)
-        h, prior = response(exposures, ratio, self.raster), prior or (FIXED if leaves else None)
+        h, prior = response(exposures, ratio, self.raster), prior or (FIXED if any(leaves) else None)
         self.spectra = spectra(frames, exposures, h, self.raster, noise, MODEL_ERROR, prior, missing=missing)
         self.strongest = column(sensitivity(exposures, ratio) ** 2)
         self.support, self.phase = self._spread(estimate)
@@ -145,7 +143,7 @@ class WaveModel:
 
     def bounded(self, phase: Tensor, support: Tensor | None = None) -> Tensor:
         """The phase where it may be (positive, unless matter is two-sided, and inside the support), zero elsewhere."""
-        return phase.clamp_min(self._least) * (self.support if support is None else support)
+        return phase.clamp_min(self.least) * (self.support if support is None else support)
 
     def thickness(self, phase: Tensor, delta: float) -> Tensor:
         """Means over the frame's pixels [V, h, w], in metres."""

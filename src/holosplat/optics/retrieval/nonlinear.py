@@ -41,6 +41,7 @@ def tikhonov(
     *,
     options: Tikhonov = Tikhonov(),
     missing: Tensor | None = None,
+    two_sided: bool = False,
     on_progress: Advance = lambda fraction: None,
 ) -> Tensor:
     """Thickness [V, H, W] in metres of one material, β of any sign, that agrees with frames [V, H, W].
@@ -55,7 +56,7 @@ def tikhonov(
 
     def solve(frames: Tensor, exposures: Exposures, noise: Noise, missing: Gaps, on_progress: Advance) -> Tensor:
         how = (options.backend, options.leaves, options.prior)
-        told = {"sign": math.copysign(1.0, delta), "missing": missing, "two_sided": options.two_sided}
+        told = {"sign": math.copysign(1.0, delta), "missing": missing, "two_sided": two_sided}
         model = WaveModel(frames, exposures, beta / delta, noise, *how, **told)
         return model.thickness(descend(model, options, on_progress)[0], delta)
 
