@@ -38,6 +38,7 @@ def test_names_of_several_series_are_warned_of(tmp_path, angles, caplog, names, 
 
 
 def test_names_without_numbers_are_one_series(tmp_path, angles, caplog):
+    caplog.set_level("WARNING")
     read_as(images(tmp_path / "frames", [f"{letter}.tif" for letter in "abcdefgh"], FRAMES), said(angles=angles))
     assert not caplog.records
 
@@ -69,6 +70,7 @@ def test_colours_that_are_equal_are_said(tmp_path, angles, caplog):
     ],
 )
 def test_angles_that_come_again_are_warned_of(tmp_path, caplog, degrees, words):
+    caplog.set_level("WARNING")
     write_scan(tmp_path / "scan.nxs", a_scan(np.asarray(degrees, dtype=float)))
     read_as(tmp_path / "scan.nxs", said())
     assert words in caplog.text
