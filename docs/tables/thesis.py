@@ -10,7 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from holosplat.beamline.declared.declaration import read_declaration
 from holosplat.report.style import scientific
+from holosplat_bench.suite.case import FOLDER
 from holosplat_bench.thesis.configurations import EVERY, PACES, THESIS_TABLE
 from holosplat_bench.thesis.findings import findings
 from holosplat_bench.thesis.folder import CURVES, Study
@@ -43,6 +45,11 @@ def number(row: Row, key: str) -> float:
     return float(row[key]) if row[key] else float("inf")
 
 
+def declared_pixel(case: str) -> float:
+    """The pixel size [m] of a case of the study, whose voxels are as large."""
+    return read_declaration(FOLDER / "thesis.toml", case).exposures()[0].views.pixel_size
+
+
 def study_of(rows: Sequence[Row]) -> Study:
     """The study that `rows`, of one schedule, case, physics and seed, are of."""
     first = rows[0]
@@ -51,6 +58,7 @@ def study_of(rows: Sequence[Row]) -> Study:
     names = [c.name for c in EVERY if c.name in table]
     delta, beta = (float(first[f"true_{name}"]) for name in ("delta", "beta"))
     about: dict[str, Any] = {"true_delta": delta, "true_beta": beta}
+    about["pixel_size_m"] = declared_pixel(first["case"])
     about["warmup_steps"] = pace.recipe(THESIS_TABLE[0], 1, 1.0).fit.schedule.warmup_steps
     curves = {name: read_curves(table[name]) for name in names}
     looks = {name: {when: look(table[name], when) for when in ("last", "best")} for name in names}

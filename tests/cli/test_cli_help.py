@@ -63,6 +63,7 @@ def test_every_command_is_in_one_group():
     assert said == worked(holosplat("-h")).out == worked(holosplat("--help-all")).out
     assert said.count("\n") < MOST_LINES
     assert all(f"\n{heading}\n" in said for heading in GROUPS)
+    assert "holosplat --version" in said
 
 
 def test_help_stands_behind_other_words_too():

@@ -39,13 +39,15 @@ def exposures(shape: tuple[int, int], views: int, pixel: float) -> Exposures:
 
 @pytest.mark.parametrize("row", list(csv.DictReader(TABLE.open())), ids=lambda row: f"{row['method']}{row['rows']}")
 def test_what_is_said_is_near_what_was_measured(row):
-    """Within a factor of 1.5 above, and 0.8 below."""
+    """Within a factor of 1.5 above, and 0.8 below, of an estimate, or of the range that frames decide in."""
     frames = exposures((int(row["rows"]), int(row["columns"])), int(row["views"]), float(row["pixel"]))
     if row["method"] == "simulate":
         said = of_simulation(frames, Simulation().samples(frames), len(frames))
     else:
         said = of_reconstruction(Sizes.of(frames), METHODS[row["method"]])
-    assert 0.8 < said.memory / 1e6 / float(row["measured_mb"]) < 1.5
+    measured = float(row["measured_mb"])
+    assert said.memory / 1e6 / measured > 0.8
+    assert (said.least_memory or said.memory) / 1e6 / measured < 1.5
 
 
 def test_sizes_are_those_of_the_waves():

@@ -17,7 +17,7 @@ from holosplat.model import measure
 from holosplat.optics.detector import poisson
 from holosplat.planning import scan_facts as looking
 from holosplat.planning.needs import UNSEEN, Needs, Seen, Sizes, of_choice, of_reconstruction
-from holosplat.planning.scan_facts import seen_of
+from holosplat.planning.scan_facts import opposite_likeness, seen_of
 from holosplat.representations import SurfaceMesh
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.red_cells import evans_fung_cell
@@ -133,3 +133,17 @@ def test_a_range_is_said_in_words():
     assert Needs(4e8, 1e6, 20, 80).line().endswith("and about 20 to 80 s of processor time")
     assert Needs(4e8, 1e6, 20, 21).line().endswith("and about 20 s of processor time")
     assert Needs(4e8, 1e6, 20, 190).times(2).line().endswith("and about 40 s to 6 min of processor time")
+
+
+@pytest.mark.parametrize("column", [11.5, 7.5, 13.25])
+def test_frames_half_a_turn_apart_are_mirrored_about_the_right_axis(column):
+    """Of a bump 3 columns from the axis; none of three views without such a pair."""
+    columns, rows = np.arange(24), np.arange(20)[:, None]
+    bumps = [1 - 0.2 * np.exp(-((columns - column - off) ** 2 + (rows - 9) ** 2) / 12) for off in (3, 1, -3)]
+    frames = np.stack(bumps).astype(np.float32)
+    views = Views.from_angles([0, 90, 180], (20, 24), 1e-6)
+    assert opposite_likeness(views.about_column(column), frames) == pytest.approx(1, abs=0.01)
+    beside = opposite_likeness(views.about_column(column + 3), frames)
+    assert beside is not None
+    assert beside < 0.6
+    assert opposite_likeness(Views.from_angles([0, 60, 120], (20, 24), 1e-6), frames) is None

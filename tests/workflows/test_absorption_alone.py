@@ -15,6 +15,7 @@ from helpers.contact import ENERGY, PIXEL, contact_scan, inside, mean_beta, turn
 from holosplat.checks import InputError
 from holosplat.geometry import Grid
 from holosplat.io.nxtomo import read_scan, write_scan
+from holosplat.io.volumes import write_volume
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import METHODS, Auto, Gaussians
 from holosplat.methods.presets import preset
@@ -174,6 +175,8 @@ def test_the_commands_run_in_contact_on_one_row(tmp_path):
         mu, beta = (np.asarray(file[name]) for name in ("mu_per_m", "beta"))
         assert file["mu_per_m"].attrs["units"] == "1/m"
     np.testing.assert_allclose(mu, 2 * wavenumber(ENERGY) * beta, rtol=1e-6)
+    itself = worked(holosplat("evaluate", run, "--scan", tmp_path / "scan.nxs", "--truth", tmp_path / "v.h5"))
+    assert "relative error of β 0.00" in itself.out
     facts = worked(holosplat("info", tmp_path / "v.h5")).out
     assert "a volume of µ and β" in facts
     refused(holosplat("export", run, "--compact", tmp_path / "c.h5"), "δ, which", "absorption alone")
@@ -185,3 +188,21 @@ def test_a_plan_in_contact():
     assert said["plan"]["waves"]["fringe"] == 0
     assert 0 < said["plan"]["detection"]["snr"] < 0.1
     assert "absorption alone" in holosplat("plan", "--distance", "0").out
+
+
+@pytest.mark.usefixtures("undrawn_reports")
+def test_a_report_of_contact_frames_shows_what_they_show(tmp_path):
+    """µ, also where the ratio δ/β is told; its truth is that of µ, too."""
+    scan, run = contact_scan([BALL], (1, 41), photons=20000), tmp_path / "run"
+    write_scan(tmp_path / "scan.nxs", scan)
+    ball = inside(Grid.of_views(scan.views), BALL) * BETA
+    write_volume(tmp_path / "truth.h5", Volume(500 * ball, ball, Grid.of_views(scan.views)))
+    how = ("--method", "tikhonov-tv", "--delta-beta", 500)
+    worked(holosplat("reconstruct", tmp_path / "scan.nxs", "--out", run, *how))
+    scores = json.loads(worked(holosplat("evaluate", run, "--truth", tmp_path / "truth.h5", "--json")).out)["volume"]
+    page = RunFolder(run).report.read_text(encoding="utf-8")
+    assert "mean µ in the matter" in page
+    assert "relative error of δ" not in page
+    assert "Projected absorption" in page
+    assert "δ is β times the ratio that was told" in page
+    assert scores["true_ratio"] == pytest.approx(500)

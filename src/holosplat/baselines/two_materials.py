@@ -17,7 +17,6 @@ from itertools import pairwise
 import numpy as np
 import torch
 from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter, gaussian_gradient_magnitude
-from scipy.optimize import nnls
 from torch import Tensor
 from torch.nn.functional import avg_pool3d
 
@@ -169,6 +168,8 @@ def absorption(
     Those whose frames, blurred until no fringe is left, come nearest to the blurred frames of `scan` (least squares,
     linearised a few times): refraction moves light about, only absorption takes it away.
     """
+    from scipy.optimize import nnls  # which takes long to load
+
     instrument, lines = _lines(scan, values, grid, backend)
     optics = scan.exposures.optical
     fringe = np.sqrt((wavelength(optics.energy_kev) * optics.distance).max()) / optics.views.pixel_size

@@ -16,7 +16,6 @@ from itertools import product
 
 import numpy as np
 import torch
-from scipy.optimize import minimize
 from torch import Tensor
 
 from ..fit.run import Run
@@ -160,6 +159,7 @@ class Explained:
 
     def _better(self, first: Parts, steps: int) -> Tensor:
         """The same of the parts of poses, packed."""
+        from scipy.optimize import minimize  # which takes long to load
 
         def moved(u: Tensor) -> Parts:
             matrices = first[0] @ (torch.eye(3, dtype=u.dtype) + u[:, :9].reshape(-1, 3, 3) / self.radius)

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from ..mesh import TriangleMesh
@@ -48,6 +47,8 @@ class Templates:
     @classmethod
     def of(cls, mesh: TriangleMesh, seen: Shadows) -> Templates:
         """Of a mesh about its centre [pixels]: poses that differ in what the frames of `seen` show of them."""
+        from scipy.spatial.transform import Rotation  # which takes long to load
+
         rotations, directions = np.unique(seen.rotations.numpy().reshape(-1, 9).round(9), axis=0, return_inverse=True)
         shapes = stretched(mesh.vertices)
         reach = max(float(np.linalg.norm(mesh.vertices @ shape.T, axis=1).max()) for shape in shapes)

@@ -300,7 +300,8 @@ def evaluate(
     from .scans import run_and_scan
 
     folder = RunFolder(run)
-    (result, measured), true_volume = run_and_scan(folder, scan, reading), read_volume_file(truth) if truth else None
+    result, measured = run_and_scan(folder, scan, reading)
+    true_volume = read_volume_file(truth, result.delta_told) if truth else None
     if truth is not None and true_volume is not None:
         require_same_field(true_volume.grid, measured.views, truth)
     evaluation = score(result, measured, true_volume)

@@ -115,7 +115,7 @@ def forecast(
     """Carry a run of track on: its bodies and their frames at later times, with a standard error.
 
     Frames of the scan after the run's last time (track --time-frames) judge the forecast, and are used for nothing
-    else.
+    else. Nothing is written before the end: after a forecast that was stopped, give the same command again.
 
     Args:
         run: Run folder of track.

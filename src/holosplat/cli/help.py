@@ -201,7 +201,11 @@ def overview(groups: Mapping[str, Sequence[tuple[str, str]]], description: str) 
         lines += ["", heading]
         for name, summary in commands:
             lines += _row(name, summary, width)
-    return "\n".join([*lines, "", f"holosplat COMMAND --help shows the essential options of a command, {ALL} all."])
+    ends = (
+        f"holosplat COMMAND --help shows the essential options of a command, {ALL} all.",
+        "holosplat --version says which one this is.",
+    )
+    return "\n".join([*lines, "", *ends])
 
 
 def _row(name: str, text: str, width: int) -> list[str]:

@@ -164,6 +164,8 @@ def plan(
 ) -> None:
     """Say what an experiment would see, resolve and store, and where its best distance and energy lie.
 
+    Nothing is written before the end: after a plan that was stopped, give the same command again.
+
     Args:
         as_json: Print JSON instead of a table.
     """

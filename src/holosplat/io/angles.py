@@ -65,12 +65,18 @@ def read_angles(path: Path) -> np.ndarray:
     values = finite(f"{path}: angles", np.array([_number(path, word) for word, _ in parts]))
     if unit := UNIT.search(f"{units.pop()} {header} {said}".replace("_", " ")):
         return values * (unit_factor(f"{path}: angles", unit[1], ANGLE_UNITS) / ANGLE_UNITS["deg"])
-    if len(values) >= FEW // 2:
-        reach = np.ptp(values) * np.array([[1.0], [len(values) / (len(values) - 1)]])
+    return degrees(str(path), values, "in a first line, '# radians' or '# degrees'")
+
+
+def degrees(label: str, values: np.ndarray, where: str) -> np.ndarray:
+    """The angles [N], which come without a unit, as degrees. Errors: `InputError` that says `where` the unit is to be
+    said, for those that cover a half or a whole turn of radians."""
+    if values.size >= FEW // 2:
+        reach = np.ptp(values) * np.array([[1.0], [values.size / (values.size - 1)]])
         require(
             not (np.abs(reach / WHOLE_TURNS - 1) < CLOSE).any(),
-            f"{path} must hold angles in degrees, but those from {values.min():.4g} to {values.max():.4g} look like "
-            "radians; say which they are in a first line, '# radians' or '# degrees'.",
+            f"{label} must hold angles in degrees, but those from {values.min():.4g} to {values.max():.4g} look like "
+            f"radians; say which they are {where}.",
         )
     return values
 
@@ -131,17 +137,20 @@ def _angle_words(path: Path, rows: list[list[str]]) -> tuple[list[str], str]:
     body = rows[1:] if header else rows
     if len(header) == 1 and body and len(body[0]) > 1:
         header = header[0].split()
+    units = [""] * len(header)
+    if header and body and len(body[0]) == len(header) and any(map(UNIT.fullmatch, body[0])):
+        units, body = body[0], body[1:]
     projections = [row for row in body if not FIELD.search(" ".join(row))]
     labelled = [LABELLED.search(" ".join(row)) for row in projections]
     if (found := [each for each in labelled if each]) and len(found) == len(projections):
         return [each[1] for each in found], " ".join((*header, *found[0][2].split()[:1]))
     if all(len(row) == 1 for row in body):
-        return [row[0] for row in body], " ".join(header)
+        return [row[0] for row in body], " ".join((*header, *units))
     named = [n for n, name in enumerate(header) if NAME.search(name)]
     if len(named) == 1 and all(len(row) == len(header) for row in body):
         frames = [n for n, name in enumerate(header) if name and ORDER.fullmatch(name)]
         body = _by_frames(body, frames[0]) if len(frames) == 1 else body
-        return [row[named[0]] for row in body], header[named[0]]
+        return [row[named[0]] for row in body], f"{header[named[0]]} {units[named[0]]}"
     raise InputError(
         f"{path} must hold one angle a line, or a table with a header that names one column 'angle', but a line holds "
         f"{max(map(len, rows))} numbers; {ADVICE}, with a point before the decimals."
@@ -179,8 +188,7 @@ def tell_angles(angles_deg: np.ndarray, source: str) -> None:
 
 
 def tell_views(scan: Scan) -> None:
-    """Warn of views whose angles or axis can hardly be meant: all from one side, a narrow fan, half of a turn's
-    matter."""
+    """Warn of views whose angles can hardly be meant: all from one side, a narrow fan, some angles twice."""
     views, one = scan.views, scan.exposures.has_one_energy and len(np.unique(scan.exposures.distance)) == 1
     angles = angles_of(views)
     if angles is None or len(views) < 2 or not one or scan.is_series:
@@ -194,6 +202,22 @@ def tell_views(scan: Scan) -> None:
             f"the angles of {len(views)} frames span {wide:.4g} degrees only; if they are radians, say so in their "
             "unit, or in the first line of the file of --angles"
         )
+    elif len(twice := _repeated(angles)) and len(twice) < len(views) // 2:
+        shown = ", ".join(f"{angle:.6g}°" for angle in twice[:FEW])
+        warn(
+            f"{len(twice)} frames have the angle of another one ({shown}); if one of them is wrong, correct it, or "
+            "leave such frames out by --leave-out"
+        )
+
+
+def _repeated(angles: np.ndarray) -> np.ndarray:
+    """The angles [degrees] that several frames of `angles` [N] have, once for each frame too many; a whole turn may end
+    where it began."""
+    order = np.argsort(angles % WHOLE_TURN, kind="stable")
+    sides = np.append(angles[order] % WHOLE_TURN, angles[order[0]] % WHOLE_TURN + WHOLE_TURN)
+    pairs = zip(order, np.append(order[1:], order[0]), np.diff(sides) < SAME_DEG)
+    ends = {0, len(angles) - 1}
+    return np.array([angles[one] for one, other, same in pairs if same and {int(one), int(other)} != ends])
 
 
 def is_half_acquisition(scan: Scan) -> bool:

@@ -21,8 +21,9 @@ from typing import Any
 import h5py
 import numpy as np
 
-from ..checks import require
+from ..checks import finite, require
 from ..units import ANGLE_UNITS, ENERGY_UNITS, LENGTH_UNITS
+from .angles import degrees
 from .guard import read_archive
 from .hdf5 import Fields, open_hdf5
 from .raw_file import DARK, FLAT, NOTHING, PROJECTION, RANGES, RAW_TAKES, Loader, ScanFile, Stack
@@ -46,9 +47,16 @@ def open_arrays(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Iterato
     with _arrays(source) as arrays:
         frames, flats, darks, angles = (_first(arrays, names) for names in (FRAMES, FLATS, DARKS, ANGLES))
         parts = [(PROJECTION, _stack(frames)), (FLAT, _stack(flats)), (DARK, _stack(darks))]
-        found: dict[str, Any] = {} if angles is None else {"angles_deg": np.asarray(angles)}
+        found: dict[str, Any] = {} if angles is None else {"angles_deg": _in_degrees(arrays, path)}
         found |= {name: _one_number(f"{path}: {name}", arrays[name]) for name in RANGES if name in arrays}
         yield ScanFile.of(source, parts, given, found)
+
+
+def _in_degrees(arrays: Mapping[str, Any], path: str | Path) -> np.ndarray:
+    """The angles [N] of an array whose name may say their unit."""
+    name = next(name for name in ANGLES if name in arrays)
+    values = finite(f"{path}: {name}", np.asarray(arrays[name], dtype=np.float64).reshape(-1))
+    return values if "deg" in name else degrees(f"{path}: {name}", values, f"by the name of the array, {ANGLES[0]}")
 
 
 @contextmanager
@@ -158,6 +166,8 @@ def _angles(fields: Fields) -> np.ndarray | None:
     """The angles [degrees]; without a unit they are degrees, as all programs of this format write them."""
     if not fields.find(THETA):
         return None
+    if {"units", "unit"}.isdisjoint(fields.dataset(THETA).attrs):
+        return degrees(fields.label(THETA), fields.numbers(THETA).reshape(-1), "by @units, 'rad' or 'deg'")
     return np.rad2deg(fields.numbers(THETA).reshape(-1) * fields.unit(THETA, ANGLE_UNITS, "deg"))
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from decimal import Decimal
 from itertools import pairwise
 from pathlib import Path
 
-from ..checks import InputError, require
+from ..checks import InputError, require, warn
 
 NUMBER = re.compile(r"\d+(?:\.\d+)*")
 HEXADECIMAL = re.compile("[0-9a-f]{1,16}")
@@ -16,6 +17,8 @@ DATE = re.compile(r"(?<!\d)((?:19|20)\d\d)([-_.]?)(0[1-9]|1[0-2])\2([0-2]\d|3[01
 """A date from the year to the day, which `_dated` makes one number with the time after it."""
 CLOCK = re.compile(r"(?<=#)(\d{8})[-_t .]*([01]\d|2[0-3])([-_.:h]?)([0-5]\d)\3([0-5]\d)(?!\d)")
 SIGNS = str.maketrans({"\N{MINUS SIGN}": "-", "m": "-", "p": "+"})
+NAMED = 4
+"""Kinds of names that a warning names at most."""
 Words = tuple[str, ...]
 Numbers = tuple[Decimal, ...]
 
@@ -25,8 +28,9 @@ def in_order(files: Sequence[Path]) -> list[Path]:
 
     Of several numbers that run differently, the running one counts the files in steps of one, or is the only whole
     number that no two files share. A date and the time after it are one number. Names without such a number are sorted
-    by their words and numbers from left to right. Errors: `InputError` where two numbers could be the running one or
-    numbers may be hexadecimal, and for two files with equal numbers.
+    by their words and numbers from left to right, with a warning where they may be those of several series. Errors:
+    `InputError` where two numbers could be the running one or numbers may be hexadecimal, and for two files with equal
+    numbers.
     """
     files = sorted(files)
     names = [file.stem.lower() for file in files]
@@ -41,6 +45,7 @@ def in_order(files: Sequence[Path]) -> list[Path]:
             )
     if len({words for words, _ in split}) > 1:
         _require_decimal(files, names, order)
+        _tell_series(files, [split[i][0] for i in order], order)
         return [files[i] for i in order]
     columns = [column for column in zip(*(numbers for _, numbers in split)) if len(set(column)) > 1]
     counting = [column for column in columns if len(set(column)) == len(column)]
@@ -78,6 +83,20 @@ def _require_decimal(files: Sequence[Path], names: Sequence[str], order: Sequenc
         f"{files[0].parent} must say by its files' names in which order the frames were taken, but numbers such as "
         f"that in {files[order[-1]].name} may be hexadecimal; write them with decimal digits.",
     )
+
+
+def _tell_series(files: Sequence[Path], words: Sequence[Words], order: Sequence[int]) -> None:
+    """Warn of files that differ in the words of their names [N], in this order, of which some are numbered: they may be
+    of several series, copies, or none of the frames."""
+    counts = Counter(words)
+    if len(counts) < len(words):
+        firsts = [(files[order[words.index(kind)]].name, count) for kind, count in counts.items()]
+        named = ", ".join(f"{count} as {name}" for name, count in firsts[:NAMED])
+        more = f" and others of {len(firsts) - NAMED} kinds" if len(firsts) > NAMED else ""
+        warn(
+            f"{files[0].parent} has files of different names, {named}{more}; they are taken for one series in this "
+            "order. If they are not, choose the frames' names by --files, or take the others out"
+        )
 
 
 def _shared(names: Sequence[str]) -> int:

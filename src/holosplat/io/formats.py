@@ -278,9 +278,9 @@ def of_time(path: Path, frame: int) -> Path:
     return path.with_name(f"{stem}_t{frame:04d}{ome}{path.suffix}")
 
 
-def read_volume_file(path: Path) -> Volume:
-    """δ and β of a volume file of any format, by its suffix."""
-    return volume_format(path).read(path).volume(path)
+def read_volume_file(path: Path, delta_told: bool = True) -> Volume:
+    """δ and β of a volume file of any format, by its suffix; without delta_told β stands for δ."""
+    return volume_format(path).read(path).volume(path, delta_told)
 
 
 @dataclass(frozen=True)

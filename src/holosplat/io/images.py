@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -56,9 +57,10 @@ def open_images(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Iterato
     source = Path(path)
     parts = [(PROJECTION, stack_of(source))] if source.is_file() else _in_folder(source, given.get("files"))
     found = {} if source.is_file() or given.get("angles_deg") is not None else _angles(source)
-    file = ScanFile.of(source, [*parts, *_greys(source, parts, given)], given, found)
+    greys = _greys(source, parts, given)
+    file = ScanFile.of(source, [*parts, *greys], given, found)
     _tell_order(file)
-    yield file
+    yield replace(file, are_counts=not greys)
 
 
 def _greys(path: Path, parts: list[tuple[int, Any]], given: Mapping[str, Any]) -> list[tuple[int, Any]]:
@@ -196,7 +198,9 @@ def _tell_order(found: ScanFile) -> None:
     first, angles = found.stacks[0], angles_of(found.exposures.views)
     if not isinstance(first, ImageStack) or angles is None or len(angles) < 2:
         return
-    ends = ", ".join(f"{which} {first.name(n)} at {angles[n]:.6g}°" for which, n in (("first", 0), ("last", -1)))
+    ends = ", ".join(
+        f"{which} {first.name(n)} at {round(angles[n], 6) + 0.0:.6g}°" for which, n in (("first", 0), ("last", -1))
+    )
     counts = [f", {count} {name}" for kind, name in KINDS.items() if (count := len(found.numbers(kind)))]
     note(f"{found.path}: {len(angles)} projections ({ends}){''.join(counts)}")
 

@@ -49,17 +49,27 @@ class Stack(Protocol):
     def __getitem__(self, index: Any, /) -> Any: ...
 
 
-def rows_of(stacks: Sequence[Stack], number: int, rows: slice, flips: tuple[bool, bool] = (False, False)) -> np.ndarray:
+def rows_of(
+    stacks: Sequence[Stack],
+    number: int,
+    rows: slice,
+    flips: tuple[bool, bool] = (False, False),
+    are_counts: bool = True,
+) -> np.ndarray:
     """The rows `rows` (from start to stop) of frame `number` of stacks that follow each other, float64, turned upright.
 
-    flips: whether the stored frames are upside down, and mirrored left to right.
+    flips: whether the stored frames are upside down, and mirrored left to right; are_counts: whether whole numbers are
+    those of a camera, whose greatest one stands for more light than it counts, or marks a gap: it becomes NaN.
     """
     for stack in stacks:
         if number < stack.shape[0]:
             upside_down, mirrored = flips
             height = stack.shape[1]
             stored = slice(height - rows.stop, height - rows.start) if upside_down else rows
-            found = np.asarray(stack[number, stored]).astype(np.float64)
+            values = np.asarray(stack[number, stored])
+            found = values.astype(np.float64)
+            if are_counts and values.dtype.kind in "iu":
+                found[values == np.iinfo(values.dtype).max] = np.nan
             return found[:: -1 if upside_down else 1, :: -1 if mirrored else 1]
         number -= stack.shape[0]
     raise IndexError(number)
@@ -78,6 +88,7 @@ class ScanFile:
     texts: the provenance.
     has_given_fields: whether flats and darks that are said beside it are among its frames already.
     divided: what is not known of light that its projections were divided by, if it says so.
+    are_counts: whether frames of whole numbers are those of a camera (`rows_of`).
     """
 
     path: Path
@@ -92,6 +103,7 @@ class ScanFile:
     kinds_label: str = "the file"
     has_given_fields: bool = False
     divided: DividedLight | None = None
+    are_counts: bool = True
 
     @classmethod
     def of(
@@ -130,7 +142,7 @@ class ScanFile:
 
     def rows(self, number: int, rows: slice) -> np.ndarray:
         """The rows `rows` (from start to stop) of frame `number`, float64, turned upright."""
-        return rows_of(self.stacks, int(number), rows, self.flips)
+        return rows_of(self.stacks, int(number), rows, self.flips, self.are_counts)
 
     def mean(self, kind: int) -> np.ndarray:
         """The mean [H, W] of the frames of `kind`; zeros where there are none."""

@@ -17,7 +17,7 @@ import numpy as np
 from ..checks import InputError, UnsaidError, finite, in_range, require, shaped, warn
 from ..geometry import Views, rotation_y
 from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, checked_distance
-from ..units import ANGLE_UNITS, ENERGY_UNITS, LENGTH_UNITS, TIME_UNITS
+from ..units import ANGLE_UNITS, ENERGY_UNITS, LENGTH_UNITS, PLANCK_TIMES_C_KEV_M, TIME_UNITS
 from .hdf5 import Fields, attribute_text, open_hdf5
 from .light import read_divided_light
 from .nxtomo_geometry import FLIPS as FLIPS
@@ -46,6 +46,7 @@ PIXEL_SIZES = ("sample/{}_pixel_size", DETECTOR + "{}_magnified_pixel_size", DET
 """Names of a pixel's size along x and y; those in the sample's plane come first."""
 DISTANCES = ("sample/propagation_distance", "instrument/detector/distance")
 ENERGIES = ("instrument/beam/incident_energy", "beam/incident_energy", "instrument/monochromator/energy")
+WAVELENGTHS = ("instrument/beam/incident_wavelength", "beam/incident_wavelength", "instrument/monochromator/wavelength")
 ANGLES = ("sample/rotation_angle", "data/rotation_angle")
 ROTATION = "sample/view_rotation"
 TIME = "sample/time"
@@ -169,7 +170,7 @@ def _say_unequal_times(fields: Fields, kinds: np.ndarray) -> None:
 def _require_no_two_missing(fields: Fields, given: Mapping[str, Any]) -> None:
     """`InputError` that names all options at once, where a file says little; one missing dataset is named by itself."""
     names = {
-        "energy_kev": ENERGIES,
+        "energy_kev": (*ENERGIES, *WAVELENGTHS),
         "distance": DISTANCES,
         "pixel_size": [n.format(x) for n in PIXEL_SIZES for x in "xy"],
     }
@@ -239,11 +240,15 @@ def _rotations_of_angles(fields: Fields, kinds: np.ndarray, given: Mapping[str, 
     unsaid = {"angles_deg": np.zeros(int((kinds == PROJECTION).sum()))}
     name = fields.need(*ANGLES, way_out="say it by --angles FILE, or add it", stand_in=unsaid)
     angles = _per_frame(fields, kinds, name)
-    if {"units", "unit"}.isdisjoint(fields.dataset(name).attrs) and np.abs(angles).max() > MOST_RADIANS:
-        raise InputError(
+    if {"units", "unit"}.isdisjoint(fields.dataset(name).attrs):
+        require(
+            np.abs(angles).max() <= MOST_RADIANS,
             f"{fields.label(name)} must carry @units, without which it is in radians, but it reaches "
-            f"{np.abs(angles).max():g}; set @units to 'deg' if these are degrees."
+            f"{np.abs(angles).max():g}; set @units to 'deg' if these are degrees.",
         )
+        if angles.any():
+            most = np.abs(angles).max()
+            warn(f"{fields.label(name)} has no @units: its angles, up to {most:.4g}, are taken as radians")
     return rotation_y(np.rad2deg(angles * fields.unit(name, ANGLE_UNITS, "rad")))
 
 
@@ -280,8 +285,12 @@ def _energies(fields: Fields, kinds: np.ndarray, given: Mapping[str, Any]) -> np
     told = said(given, "energy_kev")
     if told is not None:
         return np.full(int((kinds == PROJECTION).sum()), told)
-    name = fields.need(*ENERGIES, way_out="say it by --energy-kev, or add it", stand_in=stand_in("energy_kev"))
-    energies = _per_frame(fields, kinds, name) * fields.unit(name, ENERGY_UNITS, "keV")
+    name = fields.find(*ENERGIES) or fields.find(*WAVELENGTHS)
+    name = name or fields.need(*ENERGIES, way_out="say it by --energy-kev, or add it", stand_in=stand_in("energy_kev"))
+    if name in WAVELENGTHS:
+        energies = PLANCK_TIMES_C_KEV_M / (_per_frame(fields, kinds, name) * fields.unit(name, LENGTH_UNITS, "m"))
+    else:
+        energies = _per_frame(fields, kinds, name) * fields.unit(name, ENERGY_UNITS, "keV")
     for energy in (energies.min(), energies.max()):
         in_range(fields.label(name), float(energy), *ENERGY_RANGE_KEV, unit="keV")
     same = np.allclose(energies, energies[0], rtol=1e-6, atol=0)

@@ -22,11 +22,12 @@ IMAGES = (".tif", ".tiff", ".png")
 class ImageStack:
     """Grey images [n, H, W] of files; pages of TIFF files are images of their own.
 
-    pages: file and page of each image.
+    pages: file and page of each image; dtype: of the first one, which all others have.
     """
 
     pages: tuple[tuple[Path, int], ...]
     shape: tuple[int, int, int]
+    dtype: np.dtype[Any]
 
     @classmethod
     def of(cls, files: Sequence[Path]) -> ImageStack:
@@ -34,7 +35,7 @@ class ImageStack:
         pages = tuple((file, page) for file in files for page in _pages(file))
         require(len(pages) > 0, f"{files[0]} must hold an image, but it holds none; it may be damaged.")
         first = _image(*pages[0])
-        return cls(pages, (len(pages), *first.shape))
+        return cls(pages, (len(pages), first.shape[0], first.shape[1]), first.dtype.newbyteorder("="))
 
     def name(self, number: int) -> str:
         """The name of the file with image `number`, and which of its images that is, if there are more."""
@@ -49,6 +50,12 @@ class ImageStack:
         require(
             image.shape == self.shape[1:],
             f"{file} must have {self.shape[1:]} pixels as the first image, but it has {image.shape}.",
+        )
+        found = image.dtype.newbyteorder("=")
+        require(
+            found == self.dtype,
+            f"{file} must hold numbers of {self.dtype} as the first image, but they are {found}, whose scale may be "
+            "another; save all images alike, or choose some by --files.",
         )
         return image[rows]
 
@@ -107,6 +114,7 @@ def _image(file: Path, page: int) -> np.ndarray:
             with open_tiff(file) as opened:
                 image = image_values(opened, file, page)
     if image.ndim == 3 and image.shape[2] in (3, 4) and (image[..., :3] == image[..., :1]).all():
+        note(f"{file.parent}: images there have three equal colours, of which one is taken")
         image = image[..., 0]
     grey = image.ndim == 2 and image.dtype.kind in "iuf"
     require(grey, f"{file} must hold grey images of numbers, but one is {image.dtype} of the shape {image.shape}.")

@@ -14,7 +14,7 @@ import numpy as np
 from ..checks import InputError, note, require, warn
 from ..frames import Derived, Frames, Taken
 from ..preprocess.flat_field import relative_intensity
-from ..preprocess.odd_frames import odd_darks, odd_flats, thumbnail
+from ..preprocess.odd_frames import odd_brightness, odd_darks, odd_flats, thumbnail
 from ..preprocess.pixels import FILLED, MOST_DEFECTS, filled, lit
 from ..scan import Scan
 from .hdf5 import open_hdf5
@@ -46,7 +46,7 @@ class StoredFrames(Derived):
     dark, light: [H, W] mean dark field and mean flat field less that, light None where the file is corrected already.
     mask: [H, W] bool of the pixels that are marked as defective. These, and values that are not finite, are missing:
     they are filled from their neighbours, and their number is said.
-    held: the file that holds each projection, and its stamp when it was opened.
+    held: the file that holds each projection, and its stamp when it was opened; are_counts: as of `rows_of`.
 
     The file is opened anew for each reading. Errors: `InputError` for a file that is gone or changed, or of which more
     than a part `MOST_DEFECTS` of a frame is to be filled.
@@ -62,6 +62,7 @@ class StoredFrames(Derived):
     mask: np.ndarray
     shape: tuple[int, int, int]
     held: tuple[tuple[Path, tuple[int, ...]], ...]
+    are_counts: bool = True
 
     @classmethod
     def of(cls, file: ScanFile) -> StoredFrames:
@@ -82,7 +83,7 @@ class StoredFrames(Derived):
         whole = (len(numbers), *file.exposures.views.shape)
         places = [place for stack in file.stacks for place in _places_of(stack, path)]
         held = tuple((places[n], _stamp(places[n])) for n in numbers)
-        return cls(path, file.label, stacks, file.flips, numbers, dark, light, mask, whole, held)
+        return cls(path, file.label, stacks, file.flips, numbers, dark, light, mask, whole, held, file.are_counts)
 
     def with_missing(self, numbers: np.ndarray) -> Taken:
         """See `Frames.with_missing`."""
@@ -99,7 +100,7 @@ class StoredFrames(Derived):
                 file[stack.file][stack.name] if isinstance(stack, _Place) else stack for stack in self.stacks
             ]
             for i, n in enumerate(self.numbers[numbers]):  # one by one: raw frames are wider, and there may be many
-                raw = rows_of(stacks, int(n), slice(0, self.shape[1]), self.flips)
+                raw = rows_of(stacks, int(n), slice(0, self.shape[1]), self.flips, self.are_counts)
                 frames[i] = raw if self.light is None else relative_intensity(raw, self.dark, self.light)
         return filled(self.label, frames, ~np.isfinite(frames) & ~self.mask, self.mask, self.numbers[numbers])
 
@@ -206,7 +207,9 @@ def _without_odd(file: ScanFile, is_told: bool) -> ScanFile:
     """The file without flats and darks that are unlike the others, which it names; is_told: with them, as --leave-out
     says which frames to leave. Errors: `InputError` where half of them differ or more."""
     small = {kind: [thumbnail(file.frame(n)) for n in file.numbers(kind)] for kind in (FLAT, DARK)}
-    if not small[FLAT]:
+    if not any(
+        np.isfinite(flat).any() for flat in small[FLAT]
+    ):  # none, or all of them saturated, which whoever divides by them says
         return file
     darks, flats, found = np.array(small[DARK]), np.array(small[FLAT]), dict[int, np.ndarray]()
     if len(darks):
@@ -229,4 +232,16 @@ def _without_odd(file: ScanFile, is_told: bool) -> ScanFile:
             warn(f"{file.path}: unlike the other {word}s, {named} {kept}")
         if not is_told:
             kinds[numbers] = INVALID
+    light = odd_brightness(flats[~found[FLAT]])
+    unequal = [
+        f"{file.name(n)} has {level:.3g} times"
+        for n, level in zip(file.numbers(FLAT)[~found[FLAT]], light)
+        if level != 1
+    ]
+    if unequal:
+        note(
+            f"{file.path}: flats differ in brightness: {', '.join(unequal[:NAMED])} the usual light, and "
+            f"{'they stay' if len(unequal) > 1 else 'stays'}; if the time of exposure was another, leave such flats "
+            "out by --leave-out"
+        )
     return replace(file, kinds=kinds)

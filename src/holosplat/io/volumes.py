@@ -76,8 +76,11 @@ class Stored:
     grid: Grid
     of: Contents = REFRACTION
 
-    def volume(self, path: str | Path) -> Volume:
-        """The same as δ and β. `InputError` that names the file where its numbers are µ."""
+    def volume(self, path: str | Path, delta_told: bool = True) -> Volume:
+        """The same as δ and β, or, without delta_told, β and β. `InputError` that names the file where its numbers are
+        µ in place of δ."""
+        if not delta_told:
+            return Volume(self.arrays[1], self.arrays[1], self.grid)
         require(
             self.of is not ABSORPTION,
             f"{path} must hold δ, but it holds the attenuation coefficient µ; take a volume of δ and β.",

@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from ..checks import InputError, require
 from ..geometry import Grid
@@ -188,6 +187,8 @@ def normal_distance(one: TriangleMesh, other: TriangleMesh) -> float:
 
 def distances(points: np.ndarray, mesh: TriangleMesh) -> np.ndarray:
     """Distances [P] [m] of `points` [P, 3] [m] from the nearest points of the triangles of `mesh`."""
+    from scipy.spatial import KDTree  # which takes long to load
+
     corners = mesh.vertices[mesh.faces]
     middles = corners.mean(1)
     reach = np.linalg.norm(corners - middles[:, None], axis=-1).max()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from scipy.optimize import nnls
 from torch import Tensor
 
 from ..checks import require
@@ -68,6 +67,8 @@ ROUNDS = 10
 def _powers(found: np.ndarray, shadow: np.ndarray) -> tuple[float, float]:
     """a, b ≥ 0 of the powers `found ≈ a + b shadow` [H, W], the likeliest of squares of normal numbers: weighted least
     squares, with weights of one over the variance, which goes as the square of the mean (Nelder & Wedderburn 1972)."""
+    from scipy.optimize import nnls  # which takes long to load
+
     columns, values = np.stack([np.ones(shadow.size), shadow.ravel()], axis=1), found.ravel()
     at = np.array([values.mean(), 0.0])
     for _ in range(ROUNDS if values.any() else 0):

@@ -10,6 +10,7 @@ import shlex
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,8 @@ import numpy as np
 
 from ..baselines import HolographicTV
 from ..checks import InputError, UnsaidError
-from ..io.angles import angles_of
+from ..geometry import Views
+from ..io.angles import SAME_DEG, angles_of
 from ..io.facts import Facts, keys_of
 from ..io.raw_file import DARK, FLAT, INVALID, NAMES, PROJECTION, Loader, ScanFile
 from ..io.reading import Reading
@@ -131,7 +133,13 @@ def _facts(path: Path, reading: Reading, loader: Loader, opened: Opened, unsaid:
     numbers = evenly(np.arange(len(scan)), LOOKED)
     look = looked(np.asarray(scan.source[numbers]))
     rows = {"what": f"a scan: {loader.mark} ({loader.name})"} | keys_of(path) | _frames(scan, file)
-    rows |= _beam(scan.exposures, unsaid) | _angles(scan, file, unsaid) | look.rows()
+    rows |= _beam(scan.exposures, unsaid) | _angles(scan, file, unsaid)
+    likeness = None if "angles_deg" in unsaid else opposite_likeness(scan.views[numbers], look.frames)
+    if likeness is not None:
+        rows["half a turn on"] = (
+            f"frames are mirrored about this axis: correlation {likeness:.2f} (1 where it is right)"
+        )
+    rows |= look.rows()
     if look.is_light and unsaid.keys().isdisjoint(OPTICS):
         rows["fringes"] = look.fringes(fringes(scan.exposures) / scan.views.pixel_sizes)
     if look.is_light and not unsaid:
@@ -214,6 +222,27 @@ def _angles(scan: Scan, file: ScanFile | None, unsaid: Unsaid) -> dict[str, str]
     columns = 0.5 * (scan.views.shape[1] - 1) - scan.views.shifts[:, 0] / scan.views.pixel_sizes
     rows["axis"] = f"column {span(columns)} of {scan.views.shape[1]} (--axis-column; holosplat align --axis-only)"
     return rows
+
+
+def opposite_likeness(views: Views, frames: np.ndarray) -> float | None:
+    """The correlation of a frame of `frames` [K, H, W] with the mirror image about the axis of one half a turn on; None
+    where there are no two such frames, or no columns of both."""
+    angles = angles_of(views)
+    if angles is None or not views.has_one_pixel:
+        return None
+    pairs = combinations(range(len(angles)), 2)
+    pair = next((p for p in pairs if abs((angles[p[1]] - angles[p[0]]) % 360 - 180) < SAME_DEG), None)
+    if pair is None:
+        return None
+    columns = np.arange(views.shape[1])
+    axis = 0.5 * (len(columns) - 1) - views.shifts[list(pair), 0].mean() / views.pixel_size
+    opposite = 2 * axis - columns
+    both = (opposite >= 0) & (opposite <= len(columns) - 1)
+    one = frames[pair[0]][:, both]
+    other = np.stack([np.interp(opposite[both], columns, row) for row in frames[pair[1]]])
+    if not both.any() or not np.ptp(one) or not np.ptp(other):
+        return None
+    return float(np.corrcoef(one.ravel(), other.ravel())[0, 1])
 
 
 def _needs(scan: Scan, numbers: np.ndarray) -> dict[str, str]:

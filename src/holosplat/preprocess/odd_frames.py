@@ -62,6 +62,14 @@ def odd_flats(flats: np.ndarray) -> np.ndarray:
     return odd
 
 
+def odd_brightness(flats: np.ndarray) -> np.ndarray:
+    """[n] float: the light of each of the flats [n, h, w], less the dark, in units of their median, 1 for those that
+    are as bright as the others."""
+    levels = flats.mean(axis=(1, 2))
+    levels = levels / np.median(levels) if len(levels) and np.median(levels) > 0 else np.ones(len(levels))
+    return np.where(_unlike(levels[:, None, None], UNLIKE), levels, 1.0)
+
+
 def _unlike(frames: np.ndarray, least: float) -> np.ndarray:
     """[n] bool: which frames are off the median frame by more than `least`, and than `TIMES` as much as the others."""
     if len(frames) < 2:

@@ -39,7 +39,7 @@ def defective_pixels(dark: np.ndarray, dark_noise: np.ndarray, flat: np.ndarray)
     light = flat - dark
     usual = median_filter(light, NEIGHBOURHOOD, mode="mirror")
     low, high = RESPONSE_RANGE
-    bad = (light <= 0) | (light < low * usual) | (light > high * usual)
+    bad = ~(light > 0) | (light < low * usual) | (light > high * usual)
     for image in (dark, dark_noise):
         off = image - median_filter(image, NEIGHBOURHOOD, mode="mirror")
         usual_off = max(float(np.median(np.abs(off))) / NORMAL_MEDIAN, LEAST_COUNTS / OUTLIER)
@@ -90,8 +90,8 @@ class PixelRepair:
 
 
 def lit(label: str, light: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Flat fields less dark ones [..., H, W], 1 where they are not positive, and the `mask` [..., H, W] of defective
-    pixels with these.
+    """Flat fields less dark ones [..., H, W], 1 where they are not positive or NaN (saturated), and the
+    `mask` [..., H, W] of defective pixels with these.
 
     A warning gives their number. Errors: `InputError` for more than a part `MOST_DEFECTS` of the pixels.
     """
@@ -99,10 +99,12 @@ def lit(label: str, light: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np
     require(
         none.mean() <= MOST_DEFECTS,
         f"{label} must have flats that are brighter than its darks, but in {none.mean():.0%} of the pixels they are "
-        "not; check which frames are flats and which are darks.",
+        "not, or saturated; check which frames are flats and which are darks.",
     )
-    if none.any():
-        warn(f"{label}: {int(none.sum())} pixels whose flats are not brighter than the darks {FILLED}")
+    saturated = none & np.isnan(light)
+    for which, why in ((none & ~saturated, "not brighter than the darks"), (saturated, "saturated")):
+        if which.any():
+            warn(f"{label}: {int(which.sum())} pixels whose flats are {why} {FILLED}")
     return np.where(dim, 1.0, light), mask | dim
 
 
@@ -118,10 +120,11 @@ def filled(label: str, frames: np.ndarray, found: np.ndarray, mask: np.ndarray, 
         require(
             shares[worst] <= MOST_DEFECTS,
             f"{label} must hold relative intensities, finite and above 0, but {shares[worst]:.0%} of frame "
-            f"{numbers[worst]} are not; correct the frames by their flats and darks, crop them, or leave this one out.",
+            f"{numbers[worst]} are not, or saturated; correct the frames by their flats and darks, crop them, or leave "
+            "this one out.",
         )
         which = f"{int(found.sum())} pixels in {count} of {len(frames)} frames"
-        warn(f"{label}: {which} are not above 0, or no numbers; they {FILLED}")
+        warn(f"{label}: {which} are not above 0, no numbers or saturated; they {FILLED}")
     missing = found | mask
     if not missing.any():
         return frames, None

@@ -16,6 +16,7 @@ from ..geometry import Grid, Views
 from ..io.json import read_json
 from ..io.volumes import read_guess
 from ..methods import METHODS, learned
+from ..metrics import volume_scores
 from ..motion.measures import columns, measured
 from ..optics.background import Light
 from ..optics.sampling import views_seeing
@@ -75,9 +76,15 @@ def report_run(
             test.views.pixel_sizes,
             evaluation.verdict,
         )
-    volume, train = found.voxelise(grid), scan.train()
-    if truth is not None and not reconstruction.delta_told:
-        truth = of_absorption(truth)
+    volume, scores, material = found.voxelise(grid), evaluation.volume, found.matter.single
+    train = scan.train()
+    absorbs = not scan.exposures.distance.any()  # then δ, where it is told, is β times a ratio that no frame shows
+    if absorbs or not reconstruction.delta_told:
+        volume = of_absorption(volume)
+        truth = None if truth is None else of_absorption(truth)
+    if absorbs and reconstruction.delta_told:
+        scores = None if truth is None else volume_scores(volume, truth)
+        remark = f"{remark} {IN_CONTACT}"
     with as_written(folder.config, "of a run that has begun"):
         own = config.get("method", config.get("settings", {}))
         said: dict[str, Any] = {
@@ -96,11 +103,11 @@ def report_run(
         pixel_size=scan.views.finest,
         held_out=held_out,
         projections=_projections(found, scan.views, truth),
-        volume_scores=evaluation.volume,
+        volume_scores=scores,
         seen=views_seeing(train.exposures, grid) == len(train),
-        material_delta=found.matter.delta if found.matter.single else None,
+        material_delta=(found.matter.beta if absorbs else found.matter.delta) if material else None,
         explained=reconstruction.verdict,
-        delta_told=reconstruction.delta_told,
+        delta_told=reconstruction.delta_told and not absorbs,
         total=reconstruction.total,
         geometry=reconstruction.geometry,
         lit=_lit(reconstruction, scan, evaluation),
@@ -119,6 +126,7 @@ def report_run(
     return write_report(content, folder.report)
 
 
+IN_CONTACT = "Frames in contact show absorption, as µ = 4πβ/λ; δ is β times the ratio that was told."
 NAMES = {
     "gaussians": "Gaussian reconstruction",
     "surfaces": "Reconstruction as closed surfaces",

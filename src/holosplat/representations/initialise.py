@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.nn.functional import avg_pool3d, interpolate, max_pool3d, pad
 from torch.optim.adam import adam
@@ -270,6 +269,8 @@ def cloud_of_moments(
 
     Covariances grow by `SMOOTH`. cell: edge of a cell [m]; unit_length [m]: the cloud's unit. matter: of one channel.
     """
+    from scipy.spatial.transform import Rotation  # which takes long to load
+
     spread, axes = torch.linalg.eigh(covariance)
     axes = axes * torch.linalg.det(axes).sign()[:, None, None]  # a rotation, not a mirror
     x, y, z, w = Rotation.from_matrix(axes.numpy()).as_quat().T

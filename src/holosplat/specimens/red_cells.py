@@ -15,7 +15,6 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..checks import InputError, finite, in_range, require, shaped
 from ..mesh import TriangleMesh
@@ -346,6 +345,8 @@ def _inserted(
 def _shuffle(placed: list[_Placed], channel: _Channel, rng: np.random.Generator) -> None:
     """Moves and turns every cell a little where that is allowed: hard bodies in equilibrium, which leave more room
     than bodies put down for good (Metropolis et al. 1953, J. Chem. Phys. 21, 1087)."""
+    from scipy.spatial.transform import Rotation  # which takes long to load
+
     for i, old in enumerate(placed):
         turn = Rotation.from_rotvec(TURN * rng.standard_normal(3)).as_matrix()
         centre = old.cell.centre
@@ -359,6 +360,8 @@ def _shuffle(placed: list[_Placed], channel: _Channel, rng: np.random.Generator)
 
 def _random_rotation(rng: np.random.Generator) -> np.ndarray:
     """A uniformly distributed rotation [3, 3] (a normalised 4D Gaussian is a uniform unit quaternion)."""
+    from scipy.spatial.transform import Rotation  # which takes long to load
+
     return Rotation.from_quat(rng.standard_normal(4)).as_matrix()
 
 

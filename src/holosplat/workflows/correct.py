@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -25,7 +25,7 @@ from ..preprocess import (
     fixed_pattern,
     relative_intensity,
 )
-from ..preprocess.pixels import MOST_DEFECTS
+from ..preprocess.pixels import MOST_DEFECTS, filled
 from ..progress import Advance
 from ..ranges import ranged
 from ..scan import Scan
@@ -131,10 +131,19 @@ class FlatFielding:
 
     def __call__(self, number: int) -> np.ndarray:
         """The relative intensity [H, W] of frame `number` of the file."""
-        raw = self.repair(self.file.frame(number))
+        return self.with_missing(number)[0]
+
+    def with_missing(self, number: int) -> tuple[np.ndarray, np.ndarray]:
+        """The same, and its pixels [H, W] bool without a value of their own."""
+        raw, mask = self.file.frame(number), self.repair.mask
+        lost = ~np.isfinite(raw) & ~mask
+        if lost.any():
+            raw = filled(self.file.label, raw[None], lost[None], mask, np.array([number]))[0][0]
+        else:
+            raw = self.repair(raw)
         bright = raw.mean() > self.dark.mean()
         require(bool(bright), f"{self.file.path}: frame {number} is as dark as the dark ones; mark it invalid (3).")
-        return relative_intensity(raw, self.dark, self.flat_field(raw))
+        return relative_intensity(raw, self.dark, self.flat_field(raw)), lost | mask
 
     def flat_field(self, raw: np.ndarray) -> np.ndarray:
         """The flat field less the dark one, [H, W] counts, for a frame of counts `raw` [H, W] already repaired."""
@@ -213,17 +222,19 @@ def correct(
         }
         if options.rings is not None:
             described["rings"] = f"{options.rings} columns, {normal.pattern.std():.3%} (rms)"
-        frames, doubt = _Corrected(fielding, normal), normal.light and normal.light.doubt
+        frames, doubt = _Corrected.of(fielding, normal), normal.light and normal.light.doubt
         whole = Scan.of(frames, file.exposures, file.is_test, file.provenance() | described, doubt)
         scan = reading.applied(whole, joined=False)
-        lacks = scan[[0]].missing
+        everywhere = replace(frames, are_alike=True)
+        lacks = reading.applied(Scan.of(everywhere, file.exposures, file.is_test, {}), joined=False)[[0]].missing
         kept = {"light": scan.light, "mask": None if lacks is None else lacks[0]}
         with scan_writer(out, scan.exposures, scan.is_test, scan.provenance, **kept) as add:
             shown = set(np.linspace(0, len(scan) - 1, LOOKED_AT).round().astype(int).tolist())
             written = []
             for i in range(len(scan)):
-                add(frame := scan[[i]].frames[0])
-                written += [frame] if i in shown else []
+                one = scan[[i]]
+                add(one.frames[0], None if one.missing is None else one.missing[0])
+                written += [one.frames[0]] if i in shown else []
                 on_progress(0.5 + 0.5 * (i + 1) / len(scan))
     airless = normal.light.airless if normal.light else 0
     found = (marked, fielding.found, count, fielding.method, fielding.flats, normal.what, airless)
@@ -283,19 +294,28 @@ class Normalisation:
         return frame / by
 
 
+@dataclass(frozen=True)
 class _Corrected(Derived):
-    """The projections of an open raw file, corrected when they are read."""
+    """The projections of an open raw file, corrected when they are read; are_alike: without the pixels that are missing
+    in some of them alone."""
 
-    def __init__(self, fielding: FlatFielding, normal: Normalisation) -> None:
-        self._fielding, self._numbers, self._normal = fielding, fielding.file.numbers(PROJECTION), normal
-        self.shape = (len(self._numbers), *fielding.dark.shape)
+    fielding: FlatFielding
+    normal: Normalisation
+    numbers: np.ndarray
+    shape: tuple[int, int, int]
+    are_alike: bool = False
+
+    @classmethod
+    def of(cls, fielding: FlatFielding, normal: Normalisation) -> _Corrected:
+        numbers = fielding.file.numbers(PROJECTION)
+        return cls(fielding, normal, numbers, (len(numbers), fielding.dark.shape[0], fielding.dark.shape[1]))
 
     def with_missing(self, numbers: np.ndarray) -> Taken:
         """See `Frames.with_missing`."""
-        read = [self._normal(int(i), self._fielding(int(self._numbers[i]))) for i in numbers]
-        mask = self._fielding.repair.mask
-        missing = np.broadcast_to(mask, (len(numbers), *mask.shape)) if mask.any() else None
-        return np.stack(read).astype(np.float32), missing
+        read = [self.fielding.with_missing(int(self.numbers[i])) for i in numbers]
+        frames = np.stack([self.normal(int(i), frame) for i, (frame, _) in zip(numbers, read)])
+        missing = np.stack([self.fielding.repair.mask if self.are_alike else lost for _, lost in read])
+        return frames.astype(np.float32), missing if missing.any() else None
 
 
 def _mean_and_noise(file: ScanFile, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

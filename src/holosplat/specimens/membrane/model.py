@@ -21,7 +21,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.optimize import minimize
 from torch import Tensor
 
 from ...checks import InputError, in_range, require
@@ -350,6 +349,7 @@ def _patches(nodes: torch.Tensor, fraction: float) -> torch.Tensor:
 
 def _at_rest(membrane: Membrane, start: torch.Tensor, load: torch.Tensor) -> tuple[torch.Tensor, float]:
     """Nodes of least energy under the dead load [P, 3] [N], by L-BFGS, and the greatest force left [N]."""
+    from scipy.optimize import minimize  # which takes long to load
 
     def potential(flat: np.ndarray) -> tuple[float, np.ndarray]:
         nodes = LENGTH * torch.from_numpy(flat.reshape(-1, 3).copy())

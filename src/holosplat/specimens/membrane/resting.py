@@ -10,7 +10,6 @@ from functools import lru_cache
 
 import numpy as np
 import torch
-from scipy.optimize import minimize
 
 from ...checks import in_range, require
 from ...mesh import TriangleMesh
@@ -63,6 +62,8 @@ def _even_sphere(frequency: int) -> tuple[np.ndarray, np.ndarray]:
 
     Minimises Σ (L²/L̄² - 1)² + Σ (A/Ā - 1)² over edges L and triangles A on the cell, by L-BFGS.
     """
+    from scipy.optimize import minimize  # which takes long to load
+
     sphere, faces = geodesic_sphere(frequency)
     shape = RestShape.of(TriangleMesh(sphere, faces))
 

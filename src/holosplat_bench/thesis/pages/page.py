@@ -22,6 +22,7 @@ from holosplat.report.style import (
     decimal_scale,
     letter,
     new_figure,
+    scale_bar,
     scientific,
     styled,
 )
@@ -143,6 +144,8 @@ def lines_figure(study: Study) -> Figure:
             drawn = axes.imshow(lines[row], vmin=0, vmax=top, cmap="magma")
             axes.set(xticks=[], yticks=[], title=title if row == 0 else "")
         axes_row[0].set_ylabel(label)
+        if row == 0:
+            scale_bar(axes_row[0], every.shape[-1] * study.about["pixel_size_m"], height=0.1, beside=True)
         colour_bar(figure, drawn, axes_row[-1], "rad" if row == 0 else "", extend="max")
     return figure
 
@@ -164,6 +167,7 @@ def geometry_figure(study: Study) -> Figure:
         axes.set_title(title, loc="left")
     for axes in (*panels[len(names) + 1 :], *grid[1:, -1]):
         axes.axis("off")
+    scale_bar(panels[0], true.shape[1] * study.about["pixel_size_m"], height=0.1, beside=True)
     colour_bar(figure, drawn, grid[0, -1], f"δ ({power})", extend="max")
     return figure
 
