@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from typing import ClassVar
 
@@ -113,6 +113,31 @@ def test_fits_decide_where_flat_volumes_do_not(sharp):
     for levels, continuous, choice in trials:
         found = decide_matter(Task(noisy, RATIO), {"levels": levels, "continuous": continuous})
         assert (found.choice, found.by) == (choice, "views set aside, by fits")
+
+
+@dataclass(frozen=True)
+class Slow(Answer):
+    """A method that finds something else in all its steps."""
+
+    later: Stored
+    steps: list[float] = field(default_factory=list, compare=False)
+
+    def with_effort(self, effort: float) -> Slow:
+        self.steps.append(effort)
+        return replace(self, found=self.later) if effort == 1 else self
+
+
+@pytest.mark.parametrize(("short", "efforts"), [(0.0, [0.2]), (2.0, [0.2, 1.0])], ids=["short", "long"])
+def test_levels_that_short_fits_do_not_find_have_long_ones(soft, short, efforts):
+    """Of a soft cell, of which unseen frames say that first volumes show nothing."""
+    hidden = Decision(SHOWN, "as measured" + WITHOUT, "views set aside")
+    task, grid = Task(soft, RATIO, decisions=(hidden,)), Grid.of_views(soft.views)
+    bad, fair, good = (
+        VoxelGrid(torch.full((1, *grid.shape), x), grid, Matter.one(*MATERIAL)) for x in (short, 1.0, 0.0)
+    )
+    levels = Slow(bad, good)
+    assert decide_matter(task, {"levels": levels, "continuous": Answer(fair)}).choice == "one level"
+    assert levels.steps == efforts
 
 
 def test_fits_alone_overturn_a_known_material(soft):

@@ -21,7 +21,7 @@ from ..checks import NoMatterError
 from ..inference import Decision, Score, select
 from ..matter import MatterKind
 from ..representations import VoxelGrid
-from .first_volumes import BY_FISSION, FirstVolumes, predictions
+from .first_volumes import BY_FISSION, EFFORT, FirstVolumes, predictions
 from .method import Method, Task, solve_stages
 from .trials import WITHOUT, Trial, Trials, accepted, first_of_task, hypothesis_of, name_of
 from .uncertain import Determined, likeliest_ratio
@@ -40,7 +40,8 @@ def decide_matter(task: Task, methods: Mapping[MatterKind, Method] | None = None
     A known material has one level, two have two: that is the null, which flat volumes may keep, but fits of `methods`
     for either kind alone overturn. Where less is known and there are such methods, the null is continuous matter, which
     bounds nothing; where flat volumes predict neither better nor worse, or first volumes show no matter, these are
-    fitted. One ratio δ/β holds one level. Of views that are too few to set some aside, levels are taken.
+    fitted: briefly at first, for bodies need more steps than a smooth volume, so that short fits which speak for levels
+    are enough. One ratio δ/β holds one level. Of views that are too few to set some aside, levels are taken.
     """
     if task.prior.two_sided:
         return Decision(NAME, CONTINUOUS, "matter lies on both sides of its medium")
@@ -61,12 +62,16 @@ def decide_matter(task: Task, methods: Mapping[MatterKind, Method] | None = None
         sure = found.choice != CONTINUOUS or (not known and all(each.loses for each in found.compared))
         if methods is None or sure:
             return found
-    fits = TrialFits(task, first, methods)
+    for effort in (EFFORT, 1.0):
+        fits = TrialFits(task, first, {kind: method.with_effort(effort) for kind, method in methods.items()})
 
-    def scored(name: str, fold: int) -> Score:
-        return fits.score(name_of(first.taken), kind_of(name), fold, two=name == LEVELS[1])
+        def scored(name: str, fold: int, fits: TrialFits = fits) -> Score:
+            return fits.score(name_of(first.taken), kind_of(name), fold, two=name == LEVELS[1])
 
-    return select(NAME, candidates, scored, first.folds.count, by=f"{first.folds.by}, by fits")
+        found = select(NAME, candidates, scored, first.folds.count, by=f"{first.folds.by}, by fits")
+        if found.choice != CONTINUOUS:
+            break
+    return found
 
 
 class _FlatVolumes:
