@@ -171,7 +171,7 @@ def test_the_commands_run_in_contact_on_one_row(tmp_path):
     said = worked(holosplat("export", run, "--volume", tmp_path / "v.h5"))
     assert "δ is not told, for the frames show absorption alone" in said.err
     with h5py.File(tmp_path / "v.h5") as file:
-        assert sorted(file) == ["beta", "mu_per_m"]
+        assert sorted(file) == ["beta", "mu_per_m", "views"]
         mu, beta = (np.asarray(file[name]) for name in ("mu_per_m", "beta"))
         assert file["mu_per_m"].attrs["units"] == "1/m"
     np.testing.assert_allclose(mu, 2 * wavenumber(ENERGY) * beta, rtol=1e-6)
