@@ -10,7 +10,7 @@ import pytest
 
 from helpers.discs import PITCH, ball_lines
 from holosplat.align import Axis, AxisOptions, find_axis
-from holosplat.align.axis import LEAN, UPRIGHT
+from holosplat.align.axis import BY_ALL, BY_MIRROR, LEAN, UPRIGHT
 from holosplat.align.consistency import Estimate, combined, polynomials
 from holosplat.checks import InputError
 from holosplat.geometry import Views, rotation_y
@@ -46,6 +46,26 @@ def test_the_column_is_found_within_its_error(offset, count):
     assert found.offset.error < 0.15
     assert found.column == pytest.approx(31 + found.offset.value)
     assert not found.leans
+
+
+@pytest.mark.parametrize("columns", [slice(24, 63), slice(3, 40)], ids=["left", "right"])
+def test_frames_half_a_turn_apart_tell_an_axis_near_an_edge(columns):
+    """Of a half acquisition, most of whose matter each frame misses; odd rows, and other columns than rows."""
+    whole = scan_of(np.arange(72) * 5.0, noise=0.002)
+    scan = whole.cropped(slice(0, 41), columns)
+    found = find_axis(scan.with_views(replace(scan.views, shifts=0 * scan.views.shifts)))
+    assert found.column == pytest.approx(31 - columns.start, abs=0.1)
+    assert found.place is not None
+    assert found.place.choice == BY_MIRROR
+    assert "do not show all of the matter" in " ".join(found.lines())
+
+
+def test_where_frames_show_all_of_the_matter_all_of_them_tell_the_axis():
+    found = find_axis(scan_of(np.arange(72) * 5.0, -3.3, noise=0.002))
+    assert found.offset.value == pytest.approx(-3.3, abs=0.05)
+    assert found.lean is not None
+    assert found.place is not None
+    assert found.place.choice == BY_ALL
 
 
 def test_the_sense_of_rotation_cannot_be_told():

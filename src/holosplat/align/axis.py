@@ -8,21 +8,34 @@ from itertools import pairwise
 
 import numpy as np
 
-from ..checks import at_least, in_range, require
+from ..checks import InputError, at_least, in_range, require
 from ..geometry import Views, rotation_y
-from ..inference import Decision
+from ..inference import Compared, Decision
 from ..optics.background import LightOptions
 from ..progress import Advance
 from ..ranges import ranged
 from ..scan import Exposures, Scan
-from .consistency import Consistency, Estimate, HalfTurn, Sinograms, combined, ends_of, half_turn, may_be_half
+from .consistency import (
+    Consistency,
+    Estimate,
+    HalfTurn,
+    MirroredPairs,
+    Sinograms,
+    combined,
+    ends_of,
+    half_turn,
+    may_be_half,
+)
 from .shadows import EVEN_OR_NOT, shadows
 
+PLACE, BY_ALL, BY_MIRROR = "place of the axis", "consistency of all frames", "frames half a turn apart"
 STEP = 0.25
 """Distance of the places that are tried [columns]; a parabola finds the place between them."""
 LEAN, UPRIGHT, LEANING = "lean of the axis", "as the scan says", "leaning"
 FINE_REACH = 4
 """How far beside the place that a coarse search finds a fine one looks [columns]."""
+GROUPS = 8
+"""Groups of pairs of frames half a turn apart, whose axes tell the error of their mean."""
 FEWEST_VIEWS = 6
 """Fewer views than this leave nothing to judge an axis by."""
 
@@ -56,6 +69,7 @@ class Axis:
     lean: of the axis in the image, columns a row; positive: further right further down; None: too few rows
     column: of the axis in the frames' middle row, 0 the middle of the first one; of the first view
     turn: where a half turn ends, if not where the scan says
+    place: how its place was chosen, where frames half a turn apart tell one, too
     """
 
     offset: Estimate
@@ -63,6 +77,7 @@ class Axis:
     column: float
     rows: int
     turn: HalfTurn | None = None
+    place: Decision | None = None
 
     @property
     def leans(self) -> bool:
@@ -71,11 +86,12 @@ class Axis:
 
     @cached_property
     def decisions(self) -> tuple[Decision, ...]:
-        """On the lean, where the frames have enough rows."""
+        """On the place, where there are two, and on the lean, where the frames have enough rows."""
+        made = () if self.place is None else (self.place,)
         if self.lean is None:
-            return ()
+            return made
         found = self.lean.compared(LEANING)
-        return (Decision(LEAN, LEANING if found.wins else UPRIGHT, "likelihood ratio", (found,)),)
+        return (*made, Decision(LEAN, LEANING if found.wins else UPRIGHT, "likelihood ratio", (found,)))
 
     def applied(self, exposures: Exposures) -> Exposures:
         """The exposures with the axis where it is: detector shifts, a roll `ω_z = -atan(lean)` where it leans, and the
@@ -98,7 +114,9 @@ class Axis:
         said = [] if self.turn is None else [self.turn.line()]
         said.append(f"axis at column {self.column:.3f} ± {self.offset.error:.3f} ({moved})")
         if self.lean is None:
-            said.append("lean of the axis: the frames have too few rows to tell")
+            few = self.place is None or self.place.choice == BY_ALL
+            why = "have too few rows to tell" if few else "do not show all of the matter, so that they do not tell"
+            said.append(f"lean of the axis: the frames {why}")
         else:
             degrees = np.rad2deg(np.arctan([self.lean.value, self.lean.error]))
             used = "" if self.leans else "; not sure, left as the scan says"
@@ -120,11 +138,23 @@ def find_axis(
 ) -> Axis:
     """The axis of the object that turns in `scan`, from the consistency of its projections.
 
+    Where matter leaves the frames, as in a half acquisition, projections are not consistent. Frames half a turn apart
+    still mirror each other about the axis in the columns that both have. The axis at which they do best is taken where
+    this is surely better than near the other one.
+
     ratio: δ/β, if it is known. Errors: `InputError` for views that turn about no common axis, for fewer than
     `FEWEST_VIEWS`, and where no place within the field is better than those beside it.
     """
     sinograms = sinograms_of(scan, options, ratio, light)
-    found = _search_axis(scan, sinograms, options, on_progress)
+    pairs, found = MirroredPairs.of(sinograms), None
+    try:
+        found = _search_axis(scan, sinograms, options, on_progress)
+    except InputError:
+        if pairs is None:
+            raise
+    if pairs is not None:
+        found = _against(pairs, found, scan)
+    assert found is not None
     angles = np.unwrap(_angles(scan.views))
     if not may_be_half(angles):
         return found
@@ -134,6 +164,34 @@ def find_axis(
         return found
     turned = replace(sinograms, angles=turn.spread(np.unwrap(sinograms.angles)))
     return replace(_search_axis(scan, turned, options, on_progress), turn=turn)
+
+
+def _against(pairs: MirroredPairs, found: Axis | None, scan: Scan) -> Axis:
+    """The axis of frames half a turn apart, where it is surely better than the best one near `found`, or else `found`.
+
+    Errors: `InputError` where there is neither.
+    """
+    near = np.arange(-FINE_REACH, FINE_REACH + STEP, STEP) * (pairs.positions[1] - pairs.positions[0])
+    coarse, _ = pairs.likeliest(pairs.positions)
+    best, table = pairs.likeliest(coarse + near)
+    count = min(GROUPS, len(pairs.one))
+    tried = [minimum(coarse + near, -table[:, n::count].sum(1)) for n in range(count)]
+    places = np.array([place[0] for place in tried if place is not None])
+    before = None if found is None else pairs.likeliest(found.offset.value + near)[0]
+    gains = pairs.told(best) - (0.0 if before is None else pairs.told(before))
+    compared = Compared(BY_MIRROR, float(gains.mean()), float(gains.std(ddof=1) / np.sqrt(len(gains))))
+    wins = compared.wins and len(places) > 1
+    decision = Decision(PLACE, BY_MIRROR if wins else BY_ALL, "likelihood ratio", (compared,))
+    if found is not None and not wins:
+        return replace(found, place=decision)
+    require(wins, "the projections tell no axis; check the angles, or say where it is by --axis-column.")
+    offset = Estimate(float(places.mean()), float(places.std(ddof=1) / np.sqrt(len(places))))
+    return Axis(offset, None, _middle(scan) + offset.value, scan.views.shape[0], place=decision)
+
+
+def _middle(scan: Scan) -> float:
+    """The column of the nominal axis in the first view, 0 the middle of the first one."""
+    return 0.5 * (scan.views.shape[1] - 1) - float(scan.views.shifts[0, 0]) / scan.views.pixel_size
 
 
 def _search_axis(scan: Scan, sinograms: Sinograms, options: AxisOptions, on_progress: Advance) -> Axis:
@@ -147,8 +205,7 @@ def _search_axis(scan: Scan, sinograms: Sinograms, options: AxisOptions, on_prog
     reach = (2 * factor + FINE_REACH) * pitch + abs(lean) * 0.5 * float(np.ptp(sinograms.heights))
     fine = AxisSearch.of(sinograms, near, reach, STEP * pitch, lambda f: on_progress(0.5 + 0.5 * f))
     offset, leaning = fine.found(lean)
-    middle = 0.5 * (width - 1) - float(scan.views.shifts[0, 0]) / scan.views.pixel_size
-    return Axis(offset, leaning, middle + offset.value, scan.views.shape[0])
+    return Axis(offset, leaning, _middle(scan) + offset.value, scan.views.shape[0])
 
 
 def sinograms_of(scan: Scan, options: AxisOptions, ratio: float | None, light: LightOptions) -> Sinograms:

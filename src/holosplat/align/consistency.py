@@ -46,6 +46,54 @@ class Sinograms:
         return Sinograms(values, self.angles, positions, self.heights)
 
 
+@dataclass(frozen=True)
+class MirroredPairs:
+    """Rows of frames half a turn apart, of which one is the mirror image of the other about the axis.
+
+    one, other: [P, B, W] of P pairs, in B slices
+    positions: [W] of the columns' centres, from the nominal axis [pixels]
+    """
+
+    one: np.ndarray
+    other: np.ndarray
+    positions: np.ndarray
+
+    @classmethod
+    def of(cls, sinograms: Sinograms) -> MirroredPairs | None:
+        """Those of frames that are half a turn apart to half a step; None where there are fewer than two."""
+        angles, positions = sinograms.angles % (2 * np.pi), sinograms.positions
+        steps = np.diff(np.unique(angles.round(6)))
+        if len(positions) > 1 or len(steps) == 0:
+            return None
+        apart = np.abs((angles[None] - angles[:, None]) % (2 * np.pi) - np.pi)
+        nearest = apart.argmin(1)
+        first = np.flatnonzero((apart.min(1) < 0.5 * np.median(steps)) & (np.arange(len(angles)) < nearest))
+        values = sinograms.values
+        return cls(values[first], values[nearest[first]], positions[0]) if len(first) > 1 else None
+
+    def told(self, offset: float) -> np.ndarray:
+        """Logarithms [P] of the likelihood ratio that frames mirror each other about `offset` [pixels], against none:
+        `-n/2 log(1 - r²)` of their correlation r in the n pixels that both have."""
+        columns, at = np.arange(len(self.positions)), 2 * offset - self.positions
+        step = self.positions[1] - self.positions[0]
+        at = (at - self.positions[0]) / step
+        both = (at >= 0) & (at <= columns[-1])
+        if both.sum() < 2:
+            return np.zeros(len(self.one))
+        low = np.minimum(at[both].astype(int), columns[-2])
+        share = at[both] - low
+        one, other = self.one[..., both], (1 - share) * self.other[..., low] + share * self.other[..., low + 1]
+        one, other = (rows - rows.mean(-1, keepdims=True) for rows in (one, other))
+        sums = [(a * b).sum((1, 2)) for a, b in ((one, other), (one, one), (other, other))]
+        r = np.clip(sums[0] / np.sqrt(np.maximum(sums[1] * sums[2], 1e-300)), 0.0, 1 - 1e-9)
+        return -0.5 * one[0].size * np.log1p(-(r**2))
+
+    def likeliest(self, places: np.ndarray) -> tuple[float, np.ndarray]:
+        """The likeliest of `places` [pixels], and the table [T, P] of all."""
+        table = np.stack([self.told(float(place)) for place in places])
+        return float(places[table.sum(1).argmax()]), table
+
+
 class Consistency:
     """How far projections are from those of one turning body, if the axis lies elsewhere than said."""
 
