@@ -13,6 +13,7 @@ from holosplat.materials import HAEMOGLOBIN
 from holosplat.matter import MaterialPrior
 from holosplat.methods import Task
 from holosplat.methods.illumination import prepared
+from holosplat.optics.background import LightOptions
 from holosplat.representations import SurfaceMesh
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens import random_cells
@@ -33,7 +34,8 @@ def scan_of(photons: float) -> Scan:
 
 def task_of(photons: float) -> Task:
     """The reconstruction of these of known matter; of 2000 photons about half of the contrast is noise."""
-    return prepared(Task(scan_of(photons), MaterialPrior.known(MATTER)))
+    even = LightOptions("even", noise="white")  # what is compared is matter
+    return prepared(Task(scan_of(photons), MaterialPrior.known(MATTER), light=even))
 
 
 def mesh_of(count: int = 4) -> SurfaceMesh:

@@ -18,6 +18,7 @@ from holosplat.methods.illumination import prepared
 from holosplat.methods.method import Task
 from holosplat.methods.window import MARGIN, MULTIPLE, Windows, shown, windows_of
 from holosplat.model import measure
+from holosplat.optics.background import LightOptions
 from holosplat.optics.noise_model import NoiseModel
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.phantoms import Ball
@@ -128,7 +129,8 @@ def test_a_run_in_windows_finds_the_matter_where_it_is():
     views = Views.evenly_spaced(6, SHAPE, PIXEL)
     scan = simulate(ball(), Exposures.of(views, 20.0, 0.02), is_test=np.zeros(6, dtype=bool), oversample=2)
     said = list[str]()
-    task = Task(scan, MaterialPrior.known(MATERIAL), on_progress=lambda stage, part: said.append(stage))
+    told = {"prior": MaterialPrior.known(MATERIAL), "light": LightOptions("even", noise="white")}
+    task = Task(scan, **told, on_progress=lambda stage, part: said.append(stage))
     found = solve(Auto().with_effort(0.3), task, "levels")
     assert any(stage.startswith("windows of") for stage in said)
     grid = Grid((32, 32, 32), (PIXEL,) * 3, (44.5 * PIXEL, -55.5 * PIXEL, 14.5 * PIXEL))
