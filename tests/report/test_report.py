@@ -114,6 +114,17 @@ def test_slices_enclose_what_all_views_show():
         assert not any(isinstance(c, QuadContourSet) for axes in figure.axes for c in axes.collections)
 
 
+def test_slices_of_one_row_have_a_line_too():
+    volumes = []
+    for each in scene():
+        grid = Grid((each.grid.shape[0], 1, each.grid.shape[2]), each.grid.voxel_size, each.grid.origin)
+        volumes.append(Volume(each.delta[:, 9:10], each.beta[:, 9:10], grid))
+    seen = np.zeros(volumes[0].grid.shape, dtype=bool)
+    seen[..., 4:-5] = True
+    figure = slices_figure(volumes[1], volumes[0], richest_planes(volumes[0]), seen=seen)
+    assert any(isinstance(c, QuadContourSet) for axes in figure.axes for c in axes.collections)
+
+
 def test_the_report_says_how_much_matter_some_views_miss(undrawn_reports):
     truth, _ = scene()
     seen = np.zeros(truth.grid.shape, dtype=bool)

@@ -262,7 +262,8 @@ def slice_row(
         ink = "white" if colours != SIGNED_MAP else "black"
         scale_bar(panel, width, ink)
         if seen is not None and len(np.unique(inside := _slice(seen, axis, positions[axis]))) > 1:
-            i, j = ((np.arange(n) + 0.5) * edge[name] for n, name in zip(inside.shape, (down, across)))
+            inside = np.pad(inside, 1, mode="edge")  # contours want two rows
+            i, j = ((np.arange(n) - 0.5) * edge[name] for n, name in zip(inside.shape, (down, across)))
             panel.autoscale(False)
             panel.contour(j, i, inside, levels=[0.5], colors=ink, linewidths=0.7, linestyles="dashed")
     return drawn
