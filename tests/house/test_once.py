@@ -53,7 +53,7 @@ def test_runs_that_share_are_as_runs_that_do_not():
     alone = solve(QUICK, task)
     with once(memory):
         first, again = solve(QUICK, task), solve(QUICK, task)
-    assert {key[0] for key in memory.made} == {"delta", "kind", "level", "light", "ratio", "sign", "volume"}
+    assert {key[0] for key in memory.made} == {"delta", "kind", "level", "light", "ratio", "sides", "sign", "volume"}
     for name, value in alone.parameters().items():
         assert torch.equal(first.parameters()[name], value)
         assert torch.equal(again.parameters()[name], value)
