@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -280,6 +281,25 @@ def test_fits_decide_where_first_volumes_show_no_matter(sharp, monkeypatch):
     last = [each for each in made if each.name == STAGE and each.by.endswith("by fits")]
     assert [each.choice for each in last] == [FLUX, FLUX]
     assert asked == {"levels", "continuous"}
+
+
+def test_first_volumes_need_not_surely_show_matter(monkeypatch):
+    """One frame is explained, and one hardly: fits of all hypotheses would cost many times as much."""
+    noise = torch.from_numpy(np.random.default_rng(0).normal(size=(2, 32, 32)))
+
+    class Volumes:
+        def __init__(self, *_: object) -> None: ...
+
+        def score(self, name: str, fold: int) -> Score:
+            return Score.of(
+                noise * (1.0 if name.endswith("without matter") else torch.tensor([0.4, 1.2])[:, None, None])
+            )
+
+    monkeypatch.setattr("holosplat.methods.illumination.Trials", Volumes)
+    first = SimpleNamespace(folds=SimpleNamespace(count=1, by="views set aside"))
+    found = shows_matter(first, LightOptions(), ())  # type: ignore[arg-type]
+    assert found.choice == "as measured"
+    assert not found.compared[0].wins
 
 
 def test_first_volumes_decide_where_they_show_matter(sharp):
