@@ -179,10 +179,9 @@ class RadianceField(NeuralField):
         mask: Tensor,
         seed: int = 0,
         upper: float = 0.0,
-        *,
-        lower: float = 0.0,
+        **how: float,
     ) -> None:
-        super().__init__(grid, matter, network, mask, seed, upper, lower=lower)
+        super().__init__(grid, matter, network, mask, seed, upper, **how)
         self.greys = (0.0, 1.0)
         """The darkest and the brightest grey value, relative to the flat field."""
         require(matter.single, f"a radiance field is of one material, but matter has {len(matter)} channels.")
