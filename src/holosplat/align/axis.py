@@ -176,7 +176,7 @@ def _against(pairs: MirroredPairs, found: Axis | None, scan: Scan) -> Axis:
     best, table = pairs.likeliest(coarse + near)
     count = min(GROUPS, len(pairs.one))
     tried = [minimum(coarse + near, -table[:, n::count].sum(1)) for n in range(count)]
-    places = np.array([place[0] for place in tried if place is not None])
+    places = np.array([place for place in tried if place is not None])
     before = None if found is None else pairs.likeliest(found.offset.value + near)[0]
     gains = pairs.told(best) - (0.0 if before is None else pairs.told(before))
     compared = Compared(BY_MIRROR, float(gains.mean()), float(gains.std(ddof=1) / np.sqrt(len(gains))))
@@ -185,7 +185,7 @@ def _against(pairs: MirroredPairs, found: Axis | None, scan: Scan) -> Axis:
     if found is not None and not wins:
         return replace(found, place=decision)
     require(wins, "the projections tell no axis; check the angles, or say where it is by --axis-column.")
-    offset = Estimate(float(places.mean()), float(places.std(ddof=1) / np.sqrt(len(places))))
+    offset = combined(*places.T)
     return Axis(offset, None, _middle(scan) + offset.value, scan.views.shape[0], place=decision)
 
 
