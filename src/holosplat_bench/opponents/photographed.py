@@ -179,9 +179,10 @@ class RadianceField(NeuralField):
         mask: Tensor,
         seed: int = 0,
         upper: float = 0.0,
-        **how: float,
+        *,
+        lower: float = 0.0,
     ) -> None:
-        super().__init__(grid, matter, network, mask, seed, upper, **how)
+        super().__init__(grid, matter, network, mask, seed, upper, lower=lower)
         self.greys = (0.0, 1.0)
         """The darkest and the brightest grey value, relative to the flat field."""
         require(matter.single, f"a radiance field is of one material, but matter has {len(matter)} channels.")
