@@ -14,7 +14,7 @@ from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import METHODS, PerView, Task
 from holosplat.methods.contrast import ABOVE, BELOW, STAGE, decide_sign
 from holosplat.methods.illumination import prepared
-from holosplat.methods.trials import first_of_task
+from holosplat.methods.method import first_of_task
 from holosplat.metrics import volume_scores
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens import MeshScene, RodScene, random_bubbles

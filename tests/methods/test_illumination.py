@@ -19,7 +19,8 @@ from holosplat.methods import Auto, SmoothVolume, Task
 from holosplat.methods.first_volumes import BY_FISSION, BY_VIEWS, FirstVolumes, Folds
 from holosplat.methods.illumination import STAGE, prepared, shows_matter
 from holosplat.methods.levels import SHOWN
-from holosplat.methods.trials import UNEVEN, WITHOUT, Trials, first_of_task, plain_light, with_more
+from holosplat.methods.method import first_of_task
+from holosplat.methods.trials import UNEVEN, WITHOUT, Trials, plain_light, with_more
 from holosplat.optics.background import FLUX, Background, Light, LightOptions
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.red_cells import random_cells

@@ -19,7 +19,8 @@ from holosplat.matter import DeltaBeta, MaterialPrior, Matter
 from holosplat.methods import Auto, Gaussians, Method, Task, settled
 from holosplat.methods.cross_validation import MissingMatter
 from holosplat.methods.levels import CONTINUOUS, LEVELS, SHOWN, TrialFits, decide_matter, flattened
-from holosplat.methods.trials import WITHOUT, first_of_task, plain_light
+from holosplat.methods.method import first_of_task
+from holosplat.methods.trials import WITHOUT, plain_light
 from holosplat.methods.uncertain import Determined
 from holosplat.optics.background import LightOptions
 from holosplat.representations import Stored, VoxelGrid

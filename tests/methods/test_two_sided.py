@@ -17,8 +17,8 @@ from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import METHODS, SmoothVolume, Task
 from holosplat.methods.contrast import ABOVE, BOTH, STAGE, decide_sides
 from holosplat.methods.illumination import prepared
+from holosplat.methods.method import first_of_task
 from holosplat.methods.start import starting_cloud
-from holosplat.methods.trials import first_of_task
 from holosplat.optics.background import LightOptions
 from holosplat.optics.retrieval import RETRIEVALS, tikhonov
 from holosplat.scan import Exposures, Scan

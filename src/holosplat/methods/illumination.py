@@ -29,8 +29,8 @@ from .contrast import Scoring, decide_sides, decide_sign, with_sign
 from .cross_validation import predicted_frames
 from .first_volumes import BY_FISSION, EFFORT, FirstVolumes
 from .levels import SHOWN, TrialFits, blind
-from .method import Method, Task
-from .trials import UNEVEN, WITHOUT, Hypothesis, Trials, first_of_task, name_of, named, plain_light, rivals, with_more
+from .method import Method, Task, first_of_task
+from .trials import UNEVEN, WITHOUT, Hypothesis, Trials, name_of, named, plain_light, rivals, with_more
 from .volume import SmoothVolume
 
 STAGE = "light and noise"

@@ -20,10 +20,10 @@ from ..baselines.two_materials import best_levels, eroded, told_apart
 from ..checks import NoMatterError
 from ..inference import Decision, Score, select
 from ..matter import MatterKind
-from ..representations import VoxelGrid
+from ..representations import Stored, VoxelGrid
 from .first_volumes import BY_FISSION, EFFORT, FirstVolumes, predictions
-from .method import Method, Task, solve_stages
-from .trials import WITHOUT, Trial, Trials, accepted, first_of_task, hypothesis_of, name_of
+from .method import Method, Task, first_of_task, solve_stages
+from .trials import WITHOUT, Hypothesis, Trial, Trials, accepted, hypothesis_of, name_of
 from .uncertain import Determined, likeliest_ratio
 
 STAGE = "levels or continuous matter"
@@ -122,14 +122,18 @@ class TrialFits:
         """Of the fit for a `kind` of matter (two: of two levels) to the fitted frames of a fold, under the hypothesis
         that has this `name`, or as a rival of one (`trials.rivals`)."""
         hypothesis = hypothesis_of(name)
+        found = self._fit(hypothesis, kind, fold, two)
         trial = self._trials.tried(hypothesis, fold)
-        key = ("fit", hypothesis, self._methods[kind], two)
-        expected = self._first.once(key, fold, lambda: self._fitted(trial, kind, two))
+        expected = torch.ones_like(trial.expected) if found is None else predictions(found, trial.unseen)
         return self._trials.score_of(name, fold, expected)
 
-    def _fitted(self, trial: Trial, kind: MatterKind, two: bool) -> Tensor:
-        """What a fit predicts for the unseen frames; one that finds no matter, frames without any."""
-        task, method = self._task, self._methods[kind]
+    def _fit(self, hypothesis: Hypothesis, kind: MatterKind, fold: int, two: bool = False) -> Stored | None:
+        """What is fitted; None where no matter is found."""
+        key = ("fit", hypothesis, self._methods[kind], two)
+        return self._first.once(key, fold, lambda: self._fitted(hypothesis, kind, fold, two))
+
+    def _fitted(self, hypothesis: Hypothesis, kind: MatterKind, fold: int, two: bool) -> Stored | None:
+        task, method, trial = self._task, self._methods[kind], self._trials.tried(hypothesis, fold)
         task.on_progress(f"fit of coarse frames: {method.kind}", 0.0)
         seen = replace(trial.seen, frames=trial.light.evened(torch.from_numpy(trial.seen.frames)).numpy())
         prior = task.prior
@@ -138,10 +142,13 @@ class TrialFits:
             ratio = ratio_of_one(task, self._first).value if known else self._first.material.ratio
             prior = prior.with_ratio(ratio)
         fitted = replace(task, scan=seen, prior=prior, lit=trial.light, matter=kind, first=None)
+        if fitted.bounded and not prior.materials and "continuous" in self._methods:
+            volume = self._fit(hypothesis, "continuous", fold)
+            fitted = replace(fitted, likeliest=volume if isinstance(volume, VoxelGrid) else None)
         try:
-            return predictions(solve_stages(method, fitted), trial.unseen)
+            return solve_stages(method, fitted)
         except NoMatterError:
-            return torch.ones_like(trial.expected)
+            return None
 
 
 def ratio_of_one(task: Task, first: FirstVolumes) -> Determined:

@@ -22,10 +22,10 @@ from ..optics.background import Light, LightOptions
 from ..optics.noise_model import NoiseModel
 from ..optics.retrieval import absorption_alone
 from ..progress import Advance, Progress
-from ..representations import KINDS, Stored
+from ..representations import KINDS, Stored, VoxelGrid
 from ..scan import Scan
 from ..tables import with_entries
-from .first_volumes import FirstVolumes
+from .first_volumes import FirstVolumes, Folds
 from .keeper import Keeper, Unseen, placed_at, where
 from .window import windows_of
 
@@ -60,6 +60,7 @@ class Task:
     lit: what the frames say of it, once `illumination.prepared` has decided
     decisions: what was decided so far, and by what evidence
     first: first volumes of coarse frames, which decisions share
+    likeliest: the likeliest continuous volume of the frames, where it was made before; its level bounds matter
     matter: whether matter has levels, each with sharp edges, or is continuous (see `settled`)
     delta_told: whether prior or frames say what δ is
     freedom: of where the frames are, which fits then find, too; None: they are where the scan says
@@ -80,6 +81,7 @@ class Task:
     on_start: Callable[[Decision, GuessedMatter | None], None] = unheard
     decisions: tuple[Decision, ...] = ()
     first: FirstVolumes | None = None
+    likeliest: VoxelGrid | None = None
 
     def __post_init__(self) -> None:
         if not self.prior.fixes_ratio and shows_no_refraction(self.scan):
@@ -147,6 +149,15 @@ class Task:
     def report(self, stage: str) -> Advance:
         """Progress of one stage: a function of the fraction done."""
         return lambda fraction: self.on_progress(stage, fraction)
+
+
+def first_of_task(task: Task, backend: Backend = "auto") -> FirstVolumes:
+    """The first volumes that the decisions of a task share, computed by `backend` where they are new."""
+    if task.first is not None:
+        return task.first
+    one_time = task.scan.at_instant(len(task.scan.instants) // 2) if task.scan.is_series else task.scan
+    found = FirstVolumes(Folds.of(one_time), task.prior, task.on_progress)
+    return replace(found, options=replace(found.options, backend=backend))
 
 
 @dataclass(frozen=True)
@@ -273,7 +284,7 @@ def run_stages(method: Method, task: Task, look: Look, run: Run | None = None) -
 
     Ctrl-C is passed on, unless the engine ends a fit there.
     """
-    run = run or Run()
+    run, task = run or Run(), replace(task, first=first_of_task(task))
     stages, saved, more, ended = method.stages(), run.saved, run.state, Ended(None, task)
     with run.as_written():
         first = int(saved["stage"]) if saved else 0

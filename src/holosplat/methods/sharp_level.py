@@ -7,8 +7,9 @@ import numpy as np
 from ..backends import Backend
 from ..baselines.material import DEFAULT, MaterialEstimate, level_of
 from ..matter import DeltaBeta, KnownRatio
+from ..representations import VoxelGrid
 from .assumed import assumed_material
-from .method import Task
+from .method import Task, first_of_task
 from .volume import SmoothStage, SmoothVolume
 
 STAGE = "level of the matter"
@@ -28,20 +29,31 @@ def material_of_levels(task: Task, backend: Backend = "auto", options: MaterialE
     it. Where that volume is empty, or its level lower, the material is that of tomography: larger voxels than thin
     shells dilute them.
     """
-    material = assumed_material(task.scan, task.prior, task.on_progress, backend, options)
-    if not (task.bounded and isinstance(task.prior, KnownRatio)):
-        return material
+    prior = task.prior
+    if not (task.bounded and isinstance(prior, KnownRatio)):
+        return assumed_material(task.scan, prior, task.on_progress, backend, options)
+
+    def found() -> DeltaBeta:
+        material = assumed_material(task.scan, prior, task.on_progress, backend, options)
+        delta = max(material.delta, level_in(task.likeliest or _likeliest(task, options)), key=abs)
+        return DeltaBeta(delta, delta / prior.ratio)
+
+    return first_of_task(task).once(("material of levels", prior, backend, options), 0, found)
+
+
+def _likeliest(task: Task, options: MaterialEstimate) -> VoxelGrid:
     task.on_progress(STAGE, 0.0)
     few = in_few_views(task)
     stage = SmoothStage(SmoothVolume(estimate=options, max_voxels=EDGE**3, rounds=1, faint=0.0))
     fit = stage.fit(few, stage.start(few, None))
     fit.run(lambda record: task.on_progress(STAGE, fit.share))
-    found = fit.voxels
-    values = found.values[0]
-    if not bool((values > 0).any()):
-        return material
-    delta = max(material.delta, level_of(values) * found.matter.channels[0].delta, key=abs)
-    return DeltaBeta(delta, delta / task.prior.ratio)
+    return fit.voxels
+
+
+def level_in(volume: VoxelGrid) -> float:
+    """δ of the level of a volume of one channel; 0 of an empty one."""
+    values = volume.values[0]
+    return level_of(values) * volume.matter.channels[0].delta if bool((values > 0).any()) else 0.0
 
 
 def in_few_views(task: Task) -> Task:

@@ -18,8 +18,7 @@ from .gaussians import Gaussians
 from .illumination import prepared
 from .kinds import unseen_kinds
 from .levels import LEVELS, NAME, decide_matter, kind_of, ratio_of_one
-from .method import Method, Task, solve_stages
-from .trials import first_of_task
+from .method import Method, Task, first_of_task, solve_stages
 from .uncertain import Determined, Uncertain, determine, placed, told
 
 

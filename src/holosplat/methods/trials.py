@@ -9,7 +9,6 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from ..backends import Backend
 from ..checks import InputError
 from ..inference import MARGIN, Score
 from ..optics.background import FLUX, Background, Light, LightOptions
@@ -18,7 +17,7 @@ from ..optics.noise_model import NoiseModel
 from ..optics.patterns import fixed_pattern
 from ..representations import VoxelGrid
 from ..scan import Scan
-from .first_volumes import FirstVolumes, Folds, coarse_binning, lit_by_halves, predictions
+from .first_volumes import FirstVolumes, coarse_binning, lit_by_halves, predictions
 from .method import Task
 
 NULL = "as measured"
@@ -149,15 +148,6 @@ class Trials:
         assert light is not None
         volume = self._first.volume(fold, light)
         return Trial(volume, light, seen, unseen, predictions(volume, unseen))
-
-
-def first_of_task(task: Task, backend: Backend = "auto") -> FirstVolumes:
-    """The first volumes that the decisions of a task share, computed by `backend` where they are new."""
-    if task.first is not None:
-        return task.first
-    one_time = task.scan.at_instant(len(task.scan.instants) // 2) if task.scan.is_series else task.scan
-    found = FirstVolumes(Folds.of(one_time), task.prior, task.on_progress)
-    return replace(found, options=replace(found.options, backend=backend))
 
 
 def accepted(task: Task, first: FirstVolumes, fold: int) -> Trial:
