@@ -20,7 +20,7 @@ from .rays import rays_of
 from .tomography import TotalVariation, plateau, tv_solver
 
 TRIAL_DELTA = 1e-6
-"""Any size will do: the retrieved D = δT does not depend on it."""
+"""The retrieved D = δT does not depend on it, but what a weight of total variation means does."""
 
 
 @dataclass(frozen=True)
