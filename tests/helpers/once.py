@@ -27,7 +27,7 @@ from holosplat.methods.first_volumes import FirstVolumes
 from holosplat.methods.illumination import decided
 from holosplat.methods.levels import decide_matter
 from holosplat.methods.sharp_level import material_of_levels
-from holosplat.optics.background import Light, LightOptions
+from holosplat.optics.background import Light
 from holosplat.progress import Progress
 from holosplat.scan import Scan
 from holosplat.workflows.provenance import scan_hash
@@ -90,11 +90,11 @@ def once(memory: Once) -> Iterator[None]:
         prior = with_sign(first.prior, made)
         return (first if above else FirstVolumes(first.folds, prior, first.on_progress, first.options)), made
 
-    def sides(first: FirstVolumes, how: LightOptions) -> Any:
-        key = ("sides", *of(first.folds.scan), first.prior, first.taken, how)
+    def sides(first: FirstVolumes, *how: Any) -> Any:
+        key = ("sides", *of(first.folds.scan), first.prior, first.taken, *how)
 
         def compute(told: Progress) -> Decision:
-            return decide_sides(replace(first, on_progress=told), how)[1]
+            return decide_sides(replace(first, on_progress=told), *how)[1]
 
         made = memory.answer(key, compute, first.on_progress)
         return (both_sides(first) if made.choice == BOTH else first), made

@@ -13,12 +13,14 @@ from holosplat.baselines import HolographicTV, holographic_tv
 from holosplat.checks import InputError
 from holosplat.cli.options import PriorOptions
 from holosplat.geometry import Grid, Views
+from holosplat.inference import Score
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import METHODS, SmoothVolume, Task
 from holosplat.methods.contrast import ABOVE, BOTH, STAGE, decide_sides
-from holosplat.methods.illumination import prepared
+from holosplat.methods.illumination import decided, prepared
 from holosplat.methods.method import first_of_task
 from holosplat.methods.start import starting_cloud
+from holosplat.methods.trials import Trials
 from holosplat.optics.background import LightOptions
 from holosplat.optics.retrieval import RETRIEVALS, tikhonov
 from holosplat.scan import Exposures, Scan
@@ -212,3 +214,24 @@ def test_the_command_line_tells_the_side():
     assert replace(told, contrast="below").prior(20.0) == told.prior(20.0)
     with pytest.raises(InputError, match="--contrast must be on the side of --material, but it is above"):
         replace(told, contrast="above").prior(20.0)
+
+
+@pytest.mark.parametrize(("taken", "chosen"), [((), ABOVE), (("uneven light",), BOTH)])
+def test_frames_are_left_alone_where_both_sides_explain_them_as_well(bodies, monkeypatch, taken, chosen):
+    """Where light was taken beside matter of one side, the null is matter of both in even light."""
+    tie = Score.of(torch.randn(2, 5, 7, generator=torch.Generator().manual_seed(1), dtype=torch.float64))
+    monkeypatch.setattr(Trials, "score", lambda *of: tie)
+    first = replace(first_of_task(Task(bodies, MaterialPrior.of_ratio(1500).signed(1))), taken=taken)
+    assert decide_sides(first, LightOptions())[1].choice == chosen
+    assert decide_sides(first, LightOptions(), taken)[1].choice == ABOVE  # its user says what the light is
+
+
+def test_light_that_is_uneven_stays_beside_bodies(bodies):
+    """Matter on both sides does not explain what light does."""
+    rows, columns = np.mgrid[-1 : 1 : SHAPE[0] * 1j, -1 : 1 : SHAPE[1] * 1j]
+    pattern = 1 + 0.05 * np.sin(9 * rows + 2) * np.cos(7 * columns)
+    lit = replace(bodies, frames=(bodies.frames * pattern).astype(np.float32))
+    first = first_of_task(Task(lit, MaterialPrior.of_ratio(1500).signed(1)))
+    first.taken, _ = decided(first, LightOptions(), (), ("fixed pattern",))
+    assert first.taken
+    assert decide_sides(first, LightOptions())[1].choice == ABOVE

@@ -17,7 +17,7 @@ from ..inference import Decision, Score, select
 from ..matter import MaterialPrior
 from ..optics.background import LightOptions
 from .first_volumes import FirstVolumes
-from .trials import WITHOUT, Trials, name_of
+from .trials import WITHOUT, Hypothesis, Trials, name_of
 
 STAGE = "sign of the contrast"
 ABOVE, BELOW = "δ above the medium's", "δ below the medium's"
@@ -59,16 +59,17 @@ def decide_sign(first: FirstVolumes, *scores: Scoring) -> tuple[FirstVolumes, tu
     return volumes[decision.choice], (decision,)
 
 
-def decide_sides(first: FirstVolumes, light: LightOptions) -> tuple[FirstVolumes, Decision]:
+def decide_sides(first: FirstVolumes, light: LightOptions, told: Hypothesis = ()) -> tuple[FirstVolumes, Decision]:
     """The first volumes of matter on one side of its medium, or on both, and the decision between them.
 
-    Light makes up for matter that may not be there. So volumes of both sides, in even light, are compared with those of
-    one in the light that was taken beside them.
+    Light makes up for matter that may not be there. So volumes of both sides, in the light that is `told` alone, are
+    compared with those of one in the light that was taken beside them. The null leaves the frames alone: where light
+    was taken, it is both sides, else one.
     """
     first.on_progress(STAGE, 0.0)
     one = ABOVE if first.prior.delta_sign > 0 else BELOW
     two = both_sides(first)
-    trials = {one: (Trials(first, light), name_of(first.taken)), BOTH: (Trials(two, light), name_of(()))}
+    trials = {one: (Trials(first, light), name_of(first.taken)), BOTH: (Trials(two, light), name_of(told))}
 
     def scored(name: str, fold: int) -> Score:
         side, without, _ = name.partition(WITHOUT)
@@ -78,8 +79,8 @@ def decide_sides(first: FirstVolumes, light: LightOptions) -> tuple[FirstVolumes
         except InputError:  # there is no such matter
             return _without_matter(first, fold)
 
-    by = first.folds.by
-    decision = select(STAGE, (one, BOTH), scored, first.folds.count, by=by, beside={BOTH: (BOTH + WITHOUT,)})
+    candidates, by = ((one, BOTH) if first.taken == told else (BOTH, one)), first.folds.by
+    decision = select(STAGE, candidates, scored, first.folds.count, by=by, beside={BOTH: (BOTH + WITHOUT,)})
     return (two if decision.choice == BOTH else first), decision
 
 
