@@ -4,20 +4,25 @@ that lie otherwise than the projections do, projections without light or without
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ..checks import note, require, warn
 from ..inference import Compared
-from ..preprocess.odd_frames import dark_or_empty, faintly_odd, odd_brightness, odd_darks, odd_flats, thumbnail
-from .raw_file import DARK, FLAT, INVALID, PROJECTION, ScanFile
+from ..preprocess.odd_frames import (
+    dark_or_empty,
+    faintly_odd,
+    level_and_pattern,
+    odd_brightness,
+    odd_darks,
+    odd_flats,
+    thumbnail,
+)
+from .raw_file import DARK, FLAT, INVALID, ScanFile
 
 NAMED = 5
 """Frames that a message names at most."""
-LOOKED_AT = 8
-"""Projections that are compared with the flats, at most."""
-
 EDGE = 8
 """Edge of the blocks of a thumbnail whose scatter gives standard errors, at most."""
 UPRIGHT: Mapping[str, Callable[[np.ndarray], np.ndarray]] = {
@@ -34,24 +39,50 @@ SQUARE: Mapping[str, Callable[[np.ndarray], np.ndarray]] = {
 """How flats may lie in place of how they stand."""
 
 
-def tell_odd(label: str, seen: Mapping[int, tuple[float, float]], is_still: bool) -> None:
-    """Warns of projections that show no matter where the others do.
+@dataclass
+class Beside:
+    """Projections beside each other and beside their flats, one after another.
 
-    seen: by number, level and pattern of the relative frame (`level_and_pattern`); is_still: whether all show the same
-    matter. Errors: `InputError` for frames without light.
+    label: of their file; still: whether all show the same matter; light: [H, W] the mean flat less the dark, None where
+    frames were divided before.
     """
-    dark, empty = dark_or_empty(*np.array([*seen.values()]).reshape(-1, 2).T)
-    names = [f"frame {n}" for n in seen]
-    require(
-        not dark.any(),
-        f"{label}: projections must have light, but beside the others there is none in {_listed(names, dark)}, as in "
-        "darks or with a closed shutter; leave such frames out by --leave-out or --views.",
-    )
-    if is_still and empty.any():
-        warn(
-            f"{label}: there is matter in the other projections, but none in {_listed(names, empty)}; if the sample "
-            "was out, leave such frames out by --leave-out or --views"
+
+    label: str
+    still: bool
+    light: np.ndarray | None
+    _seen: dict[int, tuple[float, float]] = field(default_factory=dict)
+    _log: np.ndarray | float = 0.0
+
+    def add(self, number: int, frame: np.ndarray) -> None:
+        """The relative frame [H, W] `number` of the file."""
+        small = thumbnail(frame)
+        self._seen[number] = level_and_pattern(small)
+        self._log = self._log + np.log(np.maximum(small, np.finfo(float).tiny))
+
+    def tell(self) -> None:
+        """Warns of frames without matter where the others have some, and of flats that lie otherwise. Errors:
+        `InputError` for frames without light."""
+        dark, empty = dark_or_empty(*np.array([*self._seen.values()]).T)
+        names = [f"frame {n}" for n in self._seen]
+        require(
+            not dark.any(),
+            f"{self.label}: projections must have light, but beside the others there is none in "
+            f"{_listed(names, dark)}, as in darks or with a closed shutter; leave such frames out by --leave-out or "
+            "--views.",
         )
+        if self.still and empty.any():
+            warn(
+                f"{self.label}: there is matter in the other projections, but none in {_listed(names, empty)}; if the "
+                "sample was out, leave such frames out by --leave-out or --views"
+            )
+        if self.light is None:
+            return
+        otherwise = lie_otherwise(thumbnail(self.light), np.asarray(self._log) / len(self._seen))
+        if otherwise is not None:
+            warn(
+                f"{self.label}: the projections show the pattern of the flats better if these are {otherwise.name} "
+                f"({otherwise.gain:.0%} ± {otherwise.error:.0%} less is left of it); write the flats as projections lie"
+            )
 
 
 def _listed(names: Sequence[str], which: np.ndarray) -> str:
@@ -70,12 +101,10 @@ def without_odd(file: ScanFile, is_told: bool) -> ScanFile:
     ):  # none, or all of them saturated, which whoever divides by them says
         return file
     darks, flats, found = np.array(small[DARK]), np.array(small[FLAT]), dict[int, np.ndarray]()
-    dark = np.zeros(flats.shape[1:])
     if len(darks):
         found[DARK] = odd_darks(darks, float(np.nanmedian(flats)))
         good = darks[~found[DARK]]
-        dark = np.median(good if len(good) else darks, axis=0)
-        flats = flats - dark
+        flats = flats - np.median(good if len(good) else darks, axis=0)
     found[FLAT] = odd_flats(flats)
     kinds = file.kinds.copy()
     for kind, odd in found.items():
@@ -91,13 +120,12 @@ def without_odd(file: ScanFile, is_told: bool) -> ScanFile:
             warn(f"{file.path}: unlike the other {word}s, {named} {kept}")
         if not is_told:
             kinds[numbers[odd]] = INVALID
-    _tell_flats(file, file.numbers(FLAT)[~found[FLAT]], flats[~found[FLAT]], dark)
+    _tell_flats(file, file.numbers(FLAT)[~found[FLAT]], flats[~found[FLAT]])
     return replace(file, kinds=kinds)
 
 
-def _tell_flats(file: ScanFile, numbers: np.ndarray, flats: np.ndarray, dark: np.ndarray) -> None:
-    """Says which of the flats `numbers` [n] differ from the others, and how they lie beside the projections, by
-    thumbnails [n, h, w] of them and [h, w] of the dark."""
+def _tell_flats(file: ScanFile, numbers: np.ndarray, flats: np.ndarray) -> None:
+    """Says which of the flats `numbers` [n] differ from the others, by thumbnails [n, h, w] of them less the dark."""
     light, pattern = odd_brightness(flats), faintly_odd(flats)
     unequal = [f"{file.name(n)} has {level:.3g} times" for n, level in zip(numbers, light) if level != 1]
     if unequal:
@@ -112,30 +140,21 @@ def _tell_flats(file: ScanFile, numbers: np.ndarray, flats: np.ndarray, dark: np
             f"{file.path}: flats differ in pattern, {named} of the light (rms); if the sample was in it, leave it out "
             "by --leave-out"
         )
-    projections = file.numbers(PROJECTION)
-    seen = projections[np.unique(np.linspace(0, len(projections) - 1, LOOKED_AT).round().astype(int))]
-    frames = np.array([thumbnail(file.frame(n)) for n in seen]) - dark
-    otherwise = lie_otherwise(flats.mean(axis=0), frames) if len(flats) and len(frames) else None
-    if otherwise is not None:
-        warn(
-            f"{file.path}: the projections show the pattern of the flats better if these are {otherwise.name} "
-            f"({otherwise.gain:.0%} ± {otherwise.error:.0%} less is left of it); write the flats as projections lie"
-        )
 
 
-def lie_otherwise(flat: np.ndarray, projections: np.ndarray) -> Compared | None:
-    """How the mean flat [h, w] lies if the `projections` [n, h, w], both less the dark, show its pattern better so than
-    as it stands, and than no pattern; by how much. None where they do not.
+def lie_otherwise(flat: np.ndarray, relative: np.ndarray) -> Compared | None:
+    """How the mean flat [h, w] lies if projections show its pattern better so than as it stands, and than no pattern,
+    and by how much. None where they do not.
 
-    A flat leaves `log projection - log flat` of the mean projection; blocks of it count alike, for in those without
+    relative: [h, w] mean logarithm of the projections over this flat. Its blocks count alike, for in those without
     matter a flat that is right leaves noise alone.
     """
-    least = np.finfo(float).tiny
-    seen, pattern = np.log(np.maximum(projections, least)).mean(axis=0), np.log(np.maximum(flat, least))
+    pattern = np.log(np.maximum(flat, np.finfo(float).tiny))
+    seen = relative + pattern
     ways = {**UPRIGHT, **(SQUARE if flat.shape[0] == flat.shape[1] else {})}
-    rivals = [_in_blocks(seen - pattern), _in_blocks(seen)]
+    rivals = [_in_blocks(relative), _in_blocks(seen)]
     found = {name: _in_blocks(seen - turned(pattern)) for name, turned in ways.items()}
-    floor = 1e-12 * max(float(power.max()) for power in (*rivals, *found.values())) + least
+    floor = 1e-12 * max(float(power.max()) for power in (*rivals, *found.values())) + np.finfo(float).tiny
     compared = []
     for name, power in found.items():
         gains = [0.5 * np.log((rival + floor) / (power + floor)) for rival in rivals]

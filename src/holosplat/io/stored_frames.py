@@ -14,12 +14,11 @@ import numpy as np
 from ..checks import InputError, note, require
 from ..frames import Derived, Frames, Taken
 from ..preprocess.flat_field import relative_intensity
-from ..preprocess.odd_frames import level_and_pattern, thumbnail
 from ..preprocess.pixels import FILLED, MOST_DEFECTS, filled, lit
 from ..scan import Scan
 from .hdf5 import open_hdf5
 from .light_frames import light_frames, require_filled
-from .odd_light import tell_odd, without_odd
+from .odd_light import Beside, without_odd
 from .raw_file import DARK, FLAT, INVALID, PROJECTION, Opens, ScanFile, Stack, rows_of, together
 from .reading import marked
 from .stacks import ImageStack
@@ -106,9 +105,13 @@ class StoredFrames(Derived):
             for i, n in enumerate(self.numbers[numbers]):  # one by one: raw frames are wider, and there may be many
                 raw = rows_of(stacks, int(n), slice(0, self.shape[1]), self.flips, self.are_counts)
                 frames[i] = raw if self.light is None else relative_intensity(raw, self.dark, self.light)
-        seen = zip(self.numbers[numbers].tolist(), map(level_and_pattern, map(thumbnail, frames)))
-        tell_odd(self.label, dict(seen), self.is_still)
-        return filled(self.label, frames, ~np.isfinite(frames) & ~self.mask, self.mask, self.numbers[numbers])
+        found = filled(self.label, frames, ~np.isfinite(frames) & ~self.mask, self.mask, self.numbers[numbers])
+        if 0 in numbers:  # once, where all pass by in turn
+            beside = Beside(self.label, self.is_still, self.light)
+            for number, frame in zip(self.numbers[numbers], frames):
+                beside.add(int(number), frame)
+            beside.tell()
+        return found
 
 
 def _places_of(stack: Stack, path: Path) -> list[Path]:

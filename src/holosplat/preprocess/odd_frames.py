@@ -102,9 +102,9 @@ def dark_or_empty(levels: np.ndarray, patterns: np.ndarray) -> tuple[np.ndarray,
     levels, patterns: [n] as of `level_and_pattern`. Frames without matter are as bright as the others at least, and
     their pattern is `TIMES` weaker.
     """
-    if len(levels) < 3:
-        return np.zeros(len(levels), dtype=bool), np.zeros(len(levels), dtype=bool)
     usual = float(np.median(levels))
+    if len(levels) < 3 or usual <= 0:
+        return np.zeros(len(levels), dtype=bool), np.zeros(len(levels), dtype=bool)
     dark = levels < usual / DIM
     return dark, (TIMES * patterns < np.median(patterns)) & (levels >= usual)
 

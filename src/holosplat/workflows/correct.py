@@ -13,7 +13,7 @@ from ..frames import Derived, Taken
 from ..io.atomic import require_apart, require_writable
 from ..io.formats import loader_of, open_raw
 from ..io.nxtomo import scan_writer
-from ..io.odd_light import tell_odd
+from ..io.odd_light import Beside
 from ..io.raw_file import DARK, FLAT, PROJECTION, ScanFile
 from ..io.reading import Reading
 from ..optics.air import Box
@@ -26,7 +26,6 @@ from ..preprocess import (
     fixed_pattern,
     relative_intensity,
 )
-from ..preprocess.odd_frames import level_and_pattern, thumbnail
 from ..preprocess.pixels import MOST_DEFECTS, filled
 from ..progress import Advance
 from ..ranges import ranged
@@ -238,7 +237,7 @@ def correct(
                 add(one.frames[0], None if one.missing is None else one.missing[0])
                 written += [one.frames[0]] if i in shown else []
                 on_progress(0.5 + 0.5 * (i + 1) / len(scan))
-            tell_odd(file.label, normal.seen, not whole.is_series)
+            normal.beside.tell()
     airless = normal.light.airless if normal.light else 0
     found = (marked, fielding.found, count, fielding.method, fielding.flats, normal.what, airless)
     air = Look.at(lambda i: written[i].astype(np.float64), len(written)).air()
@@ -247,15 +246,16 @@ def correct(
 
 class Normalisation:
     """What is brought to 1 in each frame, by `options`; what: its name; light: by air, where that is it; pattern: the
-    faults [H, W] of all frames that are divided out, too; divided: least and greatest number of what frames were; seen:
-    level and pattern of each before, by its number in the file."""
+    faults [H, W] of all frames that are divided out, too; divided: least and greatest number of what frames were;
+    beside: the frames before, beside each other."""
 
     def __init__(self, fielding: FlatFielding, options: CorrectionOptions) -> None:
         """Looks at all projections once where air may be found; `InputError` where it is asked for in vain."""
         self._path, wanted, numbers = fielding.file.path, options.normalise, fielding.file.numbers(PROJECTION)
-        self._numbers = numbers
+        self._numbers, still = numbers, len(np.unique(fielding.file.exposures.time)) == 1
+        self.beside = Beside(fielding.file.label, still, fielding.light)
         self.light: AirLight | None = None
-        self.divided, self.seen = (np.inf, 0.0), dict[int, tuple[float, float]]()
+        self.divided = (np.inf, 0.0)
         asked, look = wanted == "air" or bool(options.air), None
         if asked or wanted is None:
             look = Look.at(lambda i: fielding(int(numbers[i])), len(numbers))
@@ -276,7 +276,7 @@ class Normalisation:
 
     def __call__(self, number: int, frame: np.ndarray) -> np.ndarray:
         """The frame [H, W] of projection `number`, normalised."""
-        self.seen[int(self._numbers[number])] = level_and_pattern(thumbnail(frame))
+        self.beside.add(int(self._numbers[number]), frame)
         return self._evened(number, frame) / self.pattern
 
     def _evened(self, number: int, frame: np.ndarray) -> np.ndarray:
