@@ -147,20 +147,22 @@ def lie_otherwise(flat: np.ndarray, relative: np.ndarray) -> Compared | None:
     and by how much. None where they do not.
 
     relative: [h, w] mean logarithm of the projections over this flat. Its blocks count alike, for in those without
-    matter a flat that is right leaves noise alone.
+    matter a flat that is right leaves noise alone. Flats that lie otherwise leave their own asymmetry, too: what they
+    leave must be nearer to that than to nothing, so that noise, which has no sides, does not decide.
     """
-    pattern = np.log(np.maximum(flat, np.finfo(float).tiny))
-    seen = relative + pattern
+    pattern, tiny = np.log(np.maximum(flat, np.finfo(float).tiny)), np.finfo(float).tiny
     ways = {**UPRIGHT, **(SQUARE if flat.shape[0] == flat.shape[1] else {})}
-    rivals = [_in_blocks(relative), _in_blocks(seen)]
-    found = {name: _in_blocks(seen - turned(pattern)) for name, turned in ways.items()}
-    floor = 1e-12 * max(float(power.max()) for power in (*rivals, *found.values())) + np.finfo(float).tiny
-    compared = []
-    for name, power in found.items():
-        gains = [0.5 * np.log((rival + floor) / (power + floor)) for rival in rivals]
-        beside = [Compared(name, float(g.mean()), float(g.std(ddof=1) / np.sqrt(g.size))) for g in gains]
-        compared.append(min(beside, key=lambda each: each.gain))
-    best = max(compared, key=lambda each: each.gain)
+    stands, none, found = _in_blocks(relative), _in_blocks(relative + pattern), list[Compared]()
+    for name, turned in ways.items():
+        other = pattern - turned(pattern)
+        left, asymmetry = _in_blocks(relative + other), _in_blocks(other)
+        least = 1e-12 * float(max(stands.max(), none.max(), left.max())) + tiny
+        left, rivals = left + least, (stands + least, none + least)
+        gains = [0.5 * np.log(rival / left) for rival in rivals]
+        gains.append(gains[0] - 0.25 * np.log1p(asymmetry / left))
+        each = [Compared(name, float(g.mean()), float(g.std(ddof=1) / np.sqrt(g.size))) for g in gains]
+        found.append(min(each, key=lambda one: one.gain))
+    best = max(found, key=lambda one: one.gain)
     return best if best.wins else None
 
 
