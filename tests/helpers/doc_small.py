@@ -160,12 +160,6 @@ PAGES: dict[str, Small] = {
         {"reconstruct": BOTH_SIDES},
     ),
     "imaging_chain.md": Small(f"for n in 0 1 2; do {SCAN} beam$n.nxs; done"),
-    "moving_matter.md": Small(
-        """holosplat simulate --specimen stirred-blob --material "soft tissue" --detector 12 12 --pixel-size 2.6e-6 \\
-            --views 3 --test-every 0 --frame-rate 1e4 --frames 2 --out series.nxs""",
-        {"reconstruct": "--set fit.steps=4"},
-        without="stirred-blob",
-    ),
     "motion.md": Small(FLOW, {"track": TRACK}),
     "series.md": Small(f"mkdir incoming && {SCAN} incoming/a.nxs", {"watch": "--idle 1 --settle 0.1 --poll 0.1"}),
     "simulation.md": Small(
