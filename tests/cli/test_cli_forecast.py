@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import holosplat as hs
+import holosplat.cli.forecast as acting
 import holosplat.cli.track as command
 import holosplat.workflows.track as workflow
 from helpers.cli import Outcome, holosplat, refused, worked
@@ -99,6 +100,23 @@ def test_frames_that_were_held_out_judge_it(folder):
     )
     said = json.loads(worked_by("evaluate", folder / "later", "--json").out)
     assert said["train"]["mean"]["ssim"] == pytest.approx(judged["ssim"], abs=0.05)
+
+
+def test_a_forecast_that_was_cut_off_goes_on(folder, monkeypatch):
+    """--resume alone gives the same bodies, and refuses the folder of another run."""
+    out = folder / "again"
+
+    def cut_off(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(acting, "carry_on", cut_off)
+        said = holosplat("forecast", folder / "run", "--times", AHEAD, "--out", out).err
+    assert "go on with --resume" in said
+    refused(holosplat("forecast", folder / "run", "--times", 1, "--out", out, "--resume"), "--resume needs the")
+    with undrawn():
+        worked_by("forecast", "--resume", out)
+    assert (out / "tracks.csv").read_bytes() == (folder / "later" / "tracks.csv").read_bytes()
 
 
 def test_what_cannot_be_carried_on_is_refused(folder):

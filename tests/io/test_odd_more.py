@@ -11,10 +11,11 @@ import tifffile
 
 from helpers.odd_files import ANGLES, FRAMES, SHAPE, N, a_scan, images, numbered, said
 from holosplat.checks import InputError
-from holosplat.geometry import rotation_y
+from holosplat.geometry import Views, rotation_y
 from holosplat.io.angles import read_angles
 from holosplat.io.formats import read, read_as
 from holosplat.io.nxtomo import RawLayout, read_scan, scan_writer, write_scan
+from holosplat.scan import Exposures
 from holosplat.workflows.correct import correct
 
 
@@ -174,3 +175,65 @@ def test_flats_of_another_brightness_are_said(tmp_path, caplog):
         file["counts"], file["angles_deg"], file["flats"] = FRAMES, ANGLES, flats
     read_as(tmp_path / "raw.h5", said())
     assert "flats differ in brightness: frame 10 has 1.1 times the usual light" in caplog.text
+
+
+# --- frames that are not what the file says -------------------------------------------------------------------------
+
+
+def turned(path: Path, flats: np.ndarray, *odd: np.ndarray) -> Path:
+    """Counts of ten square frames of a ball that turns about the axis, the last ones being `odd`, behind such flats
+    [n, 40, 40] and four darks of 100."""
+    rng, count = np.random.default_rng(1), 10
+    y, x = np.indices((40, 40)) - 19.5
+    places = 9 * np.cos(np.linspace(0, np.pi, count))
+    thick = np.sqrt(np.maximum(0, 49 - (y - 4) ** 2 - (x - places[:, None, None]) ** 2))
+    frames = [*(LIGHT * np.exp(-0.02 * thick))[: count - len(odd)], *odd]
+    kinds = np.array([1] * len(flats) + [2] * 4 + [0] * count)
+    views = Views.evenly_spaced(len(kinds), (40, 40), 1e-6)
+    exposures = Exposures.of(views, 20.0, 0.1)
+    with scan_writer(path, exposures, np.zeros(len(kinds), bool), {}, RawLayout(kinds, np.zeros((40, 40)))) as add:
+        for frame in (*flats, *np.zeros((4, 40, 40)), *frames):
+            add(rng.poisson(frame) + 100)
+    return path
+
+
+ROWS = np.indices((40, 40))[0] / 40
+LIGHT = 20000 * np.exp(-((ROWS - 0.4) ** 2) / 0.2)
+
+
+@pytest.mark.parametrize(
+    ("way", "name"),
+    [(lambda flat: flat, ""), (lambda flat: flat.T, "transposed"), (lambda flat: flat[::-1], "upside down")],
+)
+def test_flats_that_lie_otherwise_are_named(tmp_path, caplog, way, name):
+    caplog.set_level("WARNING")
+    _ = read_scan(turned(tmp_path / "raw.nxs", np.stack([way(LIGHT)] * 3))).frames
+    assert bool(caplog.records) == bool(name)
+    assert f"pattern of the flats better if these are {name}" in caplog.text or not name
+
+
+def test_flats_say_nothing_of_how_they_lie_where_light_is_even(tmp_path, caplog):
+    caplog.set_level("WARNING")
+    turned(tmp_path / "raw.nxs", np.full((3, 40, 40), 20000.0), *np.full((10, 40, 40), 19000.0))
+    _ = read_scan(tmp_path / "raw.nxs").frames
+    assert not caplog.records
+
+
+def test_a_faint_sample_in_a_flat_is_said(tmp_path, caplog):
+    caplog.set_level("WARNING")
+    flats = np.stack([LIGHT] * 3)
+    flats[1, 10:30, 12:25] *= 0.95
+    _ = read_scan(turned(tmp_path / "raw.nxs", flats)).frames
+    assert len(caplog.records) == 1
+    assert "flats differ in pattern, frame 1 by 0.0" in caplog.text
+
+
+@pytest.mark.parametrize("act", [read_scan, lambda path: correct(path, path.with_name("out.nxs"))])
+def test_a_projection_without_the_sample_is_said_and_one_without_light_refused(tmp_path, caplog, act):
+    caplog.set_level("WARNING")
+    found = act(turned(tmp_path / "raw.nxs", np.stack([LIGHT] * 3), LIGHT))
+    _ = getattr(found, "frames", None)
+    assert "there is matter in the other projections, but none in frame 16;" in caplog.text
+    with pytest.raises(InputError, match="beside the others there is none in frame 16, as in darks"):
+        _ = act(turned(tmp_path / "dark.nxs", np.stack([LIGHT] * 3), np.full((40, 40), 30.0))).frames
+    assert not (tmp_path / "out.nxs").exists() or len(read(tmp_path / "out.nxs")) == 10

@@ -10,8 +10,10 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import holosplat as hs
+from helpers.kept import Kept
 from holosplat.bodies.rest_shape import centroid
 from holosplat.checks import InputError
+from holosplat.fit.run import Run
 from holosplat.fit.schedule import Schedule
 from holosplat.matter import Matter
 from holosplat.mesh import TriangleMesh
@@ -115,11 +117,25 @@ def test_half_sets_are_fits_to_half_of_the_times():
     )
     scan = hs.Scan(frames, exposures, np.zeros(16, dtype=bool))
     how = MotionFit(stiffness=100.0, schedule=Schedule(steps=25, views_per_step=0))
-    even, odd = (1e6 * centroid(one.bodies(0.0)[0])[1] for one in half_sets(scan, still, how))
+    halves = half_sets(scan, still, how)
+    even, odd = (1e6 * centroid(one.bodies(0.0)[0])[1] for one in halves)
     assert even == pytest.approx(0, abs=0.1)
     assert odd == pytest.approx(1, abs=0.2)
     with pytest.raises(InputError, match="8 times"):
         half_sets(scan[:8], still, replace(how))
+    journal, taken = Kept(), list[float]()
+
+    def cut_off(record: dict[str, float]) -> None:
+        taken.append(record["step"])
+        if len(taken) == 40:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        half_sets(scan, still, how, run=Run(journal), on_record=cut_off)
+    again = half_sets(scan, still, how, run=Run(journal), on_record=lambda record: taken.append(record["step"]))
+    assert len(taken) <= 2 * 25 + 1
+    for one, other in zip(again, halves):
+        np.testing.assert_array_equal(one.coefficients, other.coefficients)
 
 
 @pytest.mark.parametrize(("angles", "apart"), [((0.0, 90.0), True), ((0.0, 45.0, 90.0, 135.0), False)])

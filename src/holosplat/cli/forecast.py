@@ -22,8 +22,19 @@ from ..report.run import report_run
 from ..scan import Scan
 from ..specimens.flow.suspension import PLASMA_VISCOSITY
 from ..workflows.evaluate import evaluate
-from ..workflows.forecast import FRAMES, TABLE, Forecasted, ForecastOptions, config_of, tracked_bodies, write_forecast
+from ..workflows.forecast import (
+    FRAMES,
+    TABLE,
+    Forecasted,
+    ForecastOptions,
+    config_of,
+    require_cells,
+    tracked_bodies,
+    write_forecast,
+)
 from ..workflows.forecast import forecast as carry_on
+from ..workflows.preconditions import goes_on
+from ..workflows.provenance import environment
 from ..workflows.reconstruct import load_reconstruction
 from ..workflows.reconstruction import instants_of, reconstruction_at
 from ..workflows.refine import where_found
@@ -32,7 +43,7 @@ from ..workflows.track import COLLECTION, TRACKS
 from .places import Output
 from .progress import ProgressBar
 from .room import tell
-from .sentence import put, say
+from .sentence import interruptible, put, say
 
 
 @dataclass(frozen=True)
@@ -110,18 +121,20 @@ def forecast(
     out: Output,
     how: ForecastFlags = ForecastFlags(),
     seed: Seed = 0,
+    resume: bool = False,
     allow_external: bool = False,
 ) -> None:
     """Carry a run of track on: its bodies and their frames at later times, with a standard error.
 
     Frames of the scan after the run's last time (track --time-frames) judge the forecast, and are used for nothing
-    else. Nothing is written before the end: after a forecast that was stopped, give the same command again.
+    else.
 
     Args:
         run: Run folder of track.
         out: Run folder to make: what track writes, at the times ahead; forecast.nxs, the predicted frames;
             forecast.csv, the standard error of each body's surface; forecast.json.
         seed: Seed of the fits to half-sets.
+        resume: Go on with an interrupted forecast; --resume RUN alone, with its run and options.
         allow_external: Follow links of the run's scan to other files; only of files you trust.
     """
     Told(allow_external=allow_external).vouch(run)
@@ -129,13 +142,18 @@ def forecast(
     tracked = load_reconstruction(folder)
     tracked_bodies(tracked)
     times = np.array(instants_of(folder))
+    require_cells(tracked, times, options)
     scan = _whole_scan(folder)
     known = scan.exposures[scan.exposures.time <= times[-1]]
     tell("the forecast", of_forecast(known, options.fit.schedule.views_per_step), out)
-    with ProgressBar() as bar:
-        found = carry_on(tracked, scan, times, options, seed, on_progress=bar.show)
+    config = config_of(options, scan, folder.read_config(), seed)
     with claimed(new):
-        done = write_forecast(new, tracked, found, config_of(options, scan, folder.read_config(), seed))
+        if not goes_on(new, config, resume):
+            new.begin(config | environment("cpu"))
+        kept = f"interrupted; {out} keeps the last checkpoint, go on with --resume"
+        with interruptible(lambda: kept), ProgressBar() as bar:
+            found = carry_on(tracked, scan, times, options, seed, journal=new, on_progress=bar.show)
+        done = write_forecast(new, tracked, found)
         new.write_source(_source(folder, scan, found, out))
         put(found.lines())
         last = len(found.forecast.times) - 1

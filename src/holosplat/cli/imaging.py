@@ -14,7 +14,7 @@ from ..optics.camera import Camera
 from ..optics.illumination import Illumination
 from ..optics.resampling import Flip
 from ..units import span
-from ..workflows.correct import Corrected, CorrectionOptions
+from ..workflows.correct import FAR, Corrected, CorrectionOptions
 from ..workflows.correct import correct as correct_file
 from ..workflows.join import join as join_files
 from .places import Output
@@ -23,8 +23,6 @@ from .sentence import say
 
 OFF = 0.02
 """How far air may be off 1 before it is warned of."""
-FAR = 0.1
-"""How far the light of all frames may be off their flat field before it is warned of."""
 
 
 def record(
@@ -88,6 +86,8 @@ def _levels(done: Corrected, is_asked: bool) -> str:
         said.append("no air was found to check it by (give boxes of it by --air)")
     if done.air is not None and abs(done.air - 1) > OFF:
         wrong.append("air must be 1: take --normalise air, and see whether flats and darks are those of the frames")
+        if not is_asked and not what:
+            wrong.append("if no air is there, for matter fills the frames, they are right as they are")
     if done.normalised == "mean" and done.air is None:
         wrong.append("what all of a frame absorbs is lost; take --normalise none if flats had the same light")
     if not is_asked and what and (high < 1 - FAR or low > 1 + FAR):

@@ -11,14 +11,14 @@ from typing import Any
 import h5py
 import numpy as np
 
-from ..checks import InputError, note, require, warn
+from ..checks import InputError, note, require
 from ..frames import Derived, Frames, Taken
 from ..preprocess.flat_field import relative_intensity
-from ..preprocess.odd_frames import odd_brightness, odd_darks, odd_flats, thumbnail
 from ..preprocess.pixels import FILLED, MOST_DEFECTS, filled, lit
 from ..scan import Scan
 from .hdf5 import open_hdf5
 from .light_frames import light_frames, require_filled
+from .odd_light import Beside, without_odd
 from .raw_file import DARK, FLAT, INVALID, PROJECTION, Opens, ScanFile, Stack, rows_of, together
 from .reading import marked
 from .stacks import ImageStack
@@ -46,7 +46,8 @@ class StoredFrames(Derived):
     dark, light: [H, W] mean dark field and mean flat field less that, light None where the file is corrected already.
     mask: [H, W] bool of the pixels that are marked as defective. These, and values that are not finite, are missing:
     they are filled from their neighbours, and their number is said.
-    held: the file that holds each projection, and its stamp when it was opened; are_counts: as of `rows_of`.
+    held: the file that holds each projection, and its stamp when it was opened; are_counts: as of `rows_of`;
+    is_still: whether they are of one time, so that all show the same matter.
 
     The file is opened anew for each reading. Errors: `InputError` for a file that is gone or changed, or of which more
     than a part `MOST_DEFECTS` of a frame is to be filled.
@@ -63,6 +64,7 @@ class StoredFrames(Derived):
     shape: tuple[int, int, int]
     held: tuple[tuple[Path, tuple[int, ...]], ...]
     are_counts: bool = True
+    is_still: bool = True
 
     @classmethod
     def of(cls, file: ScanFile) -> StoredFrames:
@@ -83,7 +85,8 @@ class StoredFrames(Derived):
         whole = (len(numbers), *file.exposures.views.shape)
         places = [place for stack in file.stacks for place in _places_of(stack, path)]
         held = tuple((places[n], _stamp(places[n])) for n in numbers)
-        return cls(path, file.label, stacks, file.flips, numbers, dark, light, mask, whole, held, file.are_counts)
+        told = (file.are_counts, len(np.unique(file.exposures.time)) == 1)
+        return cls(path, file.label, stacks, file.flips, numbers, dark, light, mask, whole, held, *told)
 
     def with_missing(self, numbers: np.ndarray) -> Taken:
         """See `Frames.with_missing`."""
@@ -102,7 +105,13 @@ class StoredFrames(Derived):
             for i, n in enumerate(self.numbers[numbers]):  # one by one: raw frames are wider, and there may be many
                 raw = rows_of(stacks, int(n), slice(0, self.shape[1]), self.flips, self.are_counts)
                 frames[i] = raw if self.light is None else relative_intensity(raw, self.dark, self.light)
-        return filled(self.label, frames, ~np.isfinite(frames) & ~self.mask, self.mask, self.numbers[numbers])
+        found = filled(self.label, frames, ~np.isfinite(frames) & ~self.mask, self.mask, self.numbers[numbers])
+        if 0 in numbers:  # once, where all pass by in turn
+            beside = Beside(self.label, self.is_still, self.light)
+            for number, frame in zip(self.numbers[numbers], frames):
+                beside.add(int(number), frame)
+            beside.tell()
+        return found
 
 
 def _places_of(stack: Stack, path: Path) -> list[Path]:
@@ -159,10 +168,6 @@ def _fields_of_light(file: ScanFile) -> tuple[np.ndarray, np.ndarray | None]:
     return dark, file.mean(FLAT) - dark if len(flats) else None
 
 
-NAMED = 5
-"""Frames that a message names at most."""
-
-
 def with_fields(file: ScanFile, given: Mapping[str, Any]) -> ScanFile:
     """The file with the flats and darks that are `given` beside it (paths), after its own, and without frames to leave
     out: those that are `given` by number, or flats and darks that are unlike the others of their kind.
@@ -177,7 +182,7 @@ def with_fields(file: ScanFile, given: Mapping[str, Any]) -> ScanFile:
             if gaps is not None:
                 file = replace(file, marked=gaps if file.marked is None else gaps | (file.marked != 0))
         begin += stack.shape[0]
-    return _without_odd(file, is_told=given.get("leave_out") is not None)
+    return without_odd(file, is_told=given.get("leave_out") is not None)
 
 
 def _with_given(file: ScanFile, given: Mapping[str, Any]) -> ScanFile:
@@ -201,47 +206,3 @@ def _without(file: ScanFile, numbers: str | None) -> ScanFile:
     divided = None if file.divided is None else file.divided[np.flatnonzero(kept)]
     kinds, exposures = np.where(left, INVALID, file.kinds), file.exposures[np.flatnonzero(kept)]
     return replace(file, kinds=kinds, exposures=exposures, is_test=file.is_test[kept], divided=divided)
-
-
-def _without_odd(file: ScanFile, is_told: bool) -> ScanFile:
-    """The file without flats and darks that are unlike the others, which it names; is_told: with them, as --leave-out
-    says which frames to leave. Errors: `InputError` where half of them differ or more."""
-    small = {kind: [thumbnail(file.frame(n)) for n in file.numbers(kind)] for kind in (FLAT, DARK)}
-    if not any(
-        np.isfinite(flat).any() for flat in small[FLAT]
-    ):  # none, or all of them saturated, which whoever divides by them says
-        return file
-    darks, flats, found = np.array(small[DARK]), np.array(small[FLAT]), dict[int, np.ndarray]()
-    if len(darks):
-        found[DARK] = odd_darks(darks, float(np.nanmedian(flats)))
-        good = darks[~found[DARK]]
-        flats = flats - np.median(good if len(good) else darks, axis=0)
-    found[FLAT] = odd_flats(flats)
-    kinds = file.kinds.copy()
-    for kind, odd in found.items():
-        numbers, (word, other) = file.numbers(kind)[odd], ("flat", "dark") if kind == FLAT else ("dark", "flat")
-        first = ", ".join(file.name(n) for n in numbers[:NAMED])
-        named = f"{first} and {len(numbers) - NAMED} more" if len(numbers) > NAMED else first
-        require(
-            2 * len(numbers) < len(odd) or not len(numbers) or is_told,
-            f"{file.path} must have {word}s that are alike and no {other}s, but {named} differ; check image_key, and "
-            "leave those that are wrong by --leave-out.",
-        )
-        if len(numbers):
-            kept = "stays, as --leave-out does not name it" if is_told else "is left out; --leave-out chooses otherwise"
-            warn(f"{file.path}: unlike the other {word}s, {named} {kept}")
-        if not is_told:
-            kinds[numbers] = INVALID
-    light = odd_brightness(flats[~found[FLAT]])
-    unequal = [
-        f"{file.name(n)} has {level:.3g} times"
-        for n, level in zip(file.numbers(FLAT)[~found[FLAT]], light)
-        if level != 1
-    ]
-    if unequal:
-        note(
-            f"{file.path}: flats differ in brightness: {', '.join(unequal[:NAMED])} the usual light, and "
-            f"{'they stay' if len(unequal) > 1 else 'stays'}; if the time of exposure was another, leave such flats "
-            "out by --leave-out"
-        )
-    return replace(file, kinds=kinds)

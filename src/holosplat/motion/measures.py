@@ -15,7 +15,7 @@ import torch
 
 from ..bodies.rest_shape import moments
 from ..checks import require
-from ..fit.run import Record
+from ..fit.run import Record, Run
 from ..geometry import Views
 from ..mesh import TriangleMesh
 from ..optics.background import Light
@@ -219,6 +219,7 @@ def half_sets(
     light: Light | None = None,
     *,
     rest: Rest | None = None,
+    run: Run | None = None,
     on_record: Callable[[Record], None] = lambda record: None,
 ) -> Halves:
     """`bodies`, fitted to the frames `train` of all times, fitted on to those of every other time, both halves of them.
@@ -226,7 +227,7 @@ def half_sets(
     Times before and after determine a path, so that each half gives nearly the path of the whole, with independent
     noise. If views are too few for shapes, the halves begin with perturbed shapes, as those of standard errors do
     (`halves.astray`), but at the same middles. light: of the frames, which were divided by it; rest: the known shape of
-    the bodies. Errors: `InputError` for fewer than 8 times.
+    the bodies; run: keeps both fits, and goes on with them. Errors: `InputError` for fewer than 8 times.
     """
     times = train.instants
     require(
@@ -234,13 +235,15 @@ def half_sets(
         f"half-sets need frames of {LEAST} times or more, but there are {len(times)}; leave them with --no-half-sets.",
     )
     number = np.searchsorted(times, train.exposures.time)
-    found = []
+    found, run = [], run or Run()
     for half in (0, 1):
         kept = np.flatnonzero(number % 2 == half)
         part = None if light is None else light.part(torch.from_numpy(kept))
         start = bodies if tell_shapes(train) else _shapes_astray(bodies, seed, 1 - 2 * half)
         fit = motion_fit(train[kept], start, how, seed, part, rest)
-        fit.run(on_record)
+        kept_half = run.part(f"half-set {half}")
+        kept_half.fit("half-sets", fit, on_record)
+        kept_half.keep()
         one = fit.result().object
         assert isinstance(one, MovingSurfaces)
         found.append(one.with_parameters({"coefficients": one.coefficients.detach()}))

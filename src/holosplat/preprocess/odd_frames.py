@@ -1,4 +1,5 @@
-"""Flats and darks that are unlike the others of their kind: a dark with the beam on, a flat with the sample in it."""
+"""Frames of the wrong kind: a dark with the beam on, a flat with the sample in it, a projection without light or
+without the sample."""
 
 from __future__ import annotations
 
@@ -13,18 +14,19 @@ UNLIKE = 0.05
 TIMES = 5.0
 """So many times more than the others it must be off, too."""
 DIM = 10.0
-"""A flat of so many times less light than the others, or more, is none."""
+"""A flat of so many times less light than the others, or more, is none; a projection of so many times less, neither."""
 
 
 def thumbnail(frame: np.ndarray) -> np.ndarray:
-    """A frame [H, W] averaged over blocks of pixels to about `SIDE` rows and columns; few pixels that are no numbers do
-    not count."""
+    """The middle of a frame [H, W], averaged over blocks of pixels to about `SIDE` rows and columns; few pixels that
+    are no numbers do not count."""
     bad = ~np.isfinite(frame)
     if 0 < bad.mean() <= MOST_DEFECTS:
         frame = np.where(bad, np.median(frame[~bad]), frame)
     (h, w), step = frame.shape, [max(1, n // SIDE) for n in frame.shape]
     rows, columns = (n // s for n, s in zip((h, w), step))
-    whole = frame[: rows * step[0], : columns * step[1]]
+    top, left = (h - rows * step[0]) // 2, (w - columns * step[1]) // 2
+    whole = frame[top : top + rows * step[0], left : left + columns * step[1]]
     return whole.reshape(rows, step[0], columns, step[1]).mean(axis=(1, 3))
 
 
@@ -68,6 +70,43 @@ def odd_brightness(flats: np.ndarray) -> np.ndarray:
     levels = flats.mean(axis=(1, 2))
     levels = levels / np.median(levels) if len(levels) and np.median(levels) > 0 else np.ones(len(levels))
     return np.where(_unlike(levels[:, None, None], UNLIKE), levels, 1.0)
+
+
+def faintly_odd(flats: np.ndarray) -> np.ndarray:
+    """[n] float: by what part of the light (rms) each of the flats [n, h, w], less the dark, differs from the others in
+    its pattern beyond noise, 0 where that is not `TIMES` more than for the others; two do not tell."""
+    levels = flats.mean(axis=(1, 2))
+    if len(flats) < 3 or not (levels > 0).all():
+        return np.zeros(len(flats))
+    relative = flats / levels[:, None, None]
+    usual = np.median(relative, axis=0)
+    off = np.array([level_and_pattern(frame)[1] for frame in 1 + relative - usual])
+    return np.where(off > TIMES * np.median(off), off, 0.0)
+
+
+def level_and_pattern(frame: np.ndarray) -> tuple[float, float]:
+    """The mean of a relative frame [h, w], and how much it varies beyond its noise (rms, in units of the mean), or else
+    as much as the noise hides.
+
+    The finest diagonal wavelets tell the noise.
+    """
+    finest = 0.5 * (frame[:-1, :-1] + frame[1:, 1:] - frame[:-1, 1:] - frame[1:, :-1])
+    noise = float((finest**2).mean()) if finest.size else 0.0
+    level, power = float(frame.mean()), max(float(frame.var()) - noise, 2 * noise / np.sqrt(frame.size))
+    return level, float(np.sqrt(power)) / (level if level > 0 else 1.0)
+
+
+def dark_or_empty(levels: np.ndarray, patterns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """[n] bool: which frames have no light beside the others, and which show no matter, where the others do.
+
+    levels, patterns: [n] as of `level_and_pattern`. Frames without matter are as bright as the others at least, and
+    their pattern is `TIMES` weaker.
+    """
+    usual = float(np.median(levels))
+    if len(levels) < 3 or usual <= 0:
+        return np.zeros(len(levels), dtype=bool), np.zeros(len(levels), dtype=bool)
+    dark = levels < usual / DIM
+    return dark, (TIMES * patterns < np.median(patterns)) & (levels >= usual)
 
 
 def _unlike(frames: np.ndarray, least: float) -> np.ndarray:

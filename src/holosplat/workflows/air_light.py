@@ -11,6 +11,7 @@ import torch
 
 from ..checks import InputError
 from ..divided_light import DividedLight
+from ..inference import ERRORS
 from ..optics.air import Box, find_air, has_air
 from ..optics.background import ORDER, Light, LightOptions
 from ..optics.patterns import cosines
@@ -45,6 +46,14 @@ class Look:
         air = find_air(frames)
         levels = [float(frame[there].mean()) for frame, there in zip(frames, air) if has_air(there[None]).item()]
         return float(np.median(levels)) if levels else None
+
+    def has_matter_beside_air(self) -> bool:
+        """Whether the rest of most frames that show air is darker than it by more than it varies itself; else what
+        passes for air may be smooth matter that fills the frames."""
+        air = find_air(torch.from_numpy(self.frames)).numpy()
+        pairs = [(f[there], f[~there]) for f, there in zip(self.frames, air) if there.any() and not there.all()]
+        darker = [light.mean() - rest.mean() > ERRORS * light.std() for light, rest in pairs]
+        return 2 * sum(darker) > len(self.frames)
 
     def has_bright_border(self) -> bool:
         """Whether the left or the right border is brighter than the frame, as where matter in the middle absorbs."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -13,6 +14,7 @@ from ..frames import Derived, Taken
 from ..io.atomic import require_apart, require_writable
 from ..io.formats import loader_of, open_raw
 from ..io.nxtomo import scan_writer
+from ..io.odd_light import Beside
 from ..io.raw_file import DARK, FLAT, PROJECTION, ScanFile
 from ..io.reading import Reading
 from ..optics.air import Box
@@ -39,6 +41,8 @@ Normalise = Literal["air", "mean", "rim", "none"]
 
 LOOKED_AT = 16
 """Frames that are looked at for the level of their air, at most."""
+FAR = 0.1
+"""How far light may be off the flat field in all frames, where flats do not differ by more: else matter did it."""
 ENOUGH_FLATS = 3
 """Flats that the dynamic method needs."""
 
@@ -54,7 +58,7 @@ class CorrectionOptions:
     normalise: Normalise | None = None
     """What is brought to 1 in each frame: its air, by a smooth factor, its mean, its rim, or nothing (default: the air
     where it is uneven beyond its noise; the mean where flats change, and neither air nor a border brighter than the
-    rest is seen; else nothing)."""
+    rest is seen; else, and where that is farther off 1 than flats differ, nothing)."""
     air: tuple[Box, ...] = ()
     """Boxes without matter in any frame: first row, end row, first column, end column (default: found)."""
     rings: int | None = None
@@ -104,7 +108,7 @@ class FlatFielding:
     def __init__(self, file: ScanFile, options: CorrectionOptions, on_progress: Advance) -> None:
         self.file, self.options = file, options
         darks, self._flats = file.numbers(DARK), file.numbers(FLAT)
-        self.flats = len(self._flats)
+        self.flats, self.brightness = len(self._flats), np.ones(1)
         self.method: Method = options.method or ("dynamic" if self.flats >= ENOUGH_FLATS else "plain")
         dynamic = self.method == "dynamic"
         enough = self.flats >= (ENOUGH_FLATS if dynamic else 1)
@@ -160,6 +164,7 @@ class FlatFielding:
             repaired[i] = self.repair.values(raw)
             brightness[i] = (self.repair(raw) - self.dark).mean()
         require(bool((brightness > 0).all()), f"{self.file.path} has flats without light; mark them invalid (3).")
+        self.brightness = brightness / brightness.mean()
         h, w = self.dark.shape
 
         def rows_of(rows: slice) -> np.ndarray:
@@ -236,6 +241,7 @@ def correct(
                 add(one.frames[0], None if one.missing is None else one.missing[0])
                 written += [one.frames[0]] if i in shown else []
                 on_progress(0.5 + 0.5 * (i + 1) / len(scan))
+            normal.beside.tell()
     airless = normal.light.airless if normal.light else 0
     found = (marked, fielding.found, count, fielding.method, fielding.flats, normal.what, airless)
     air = Look.at(lambda i: written[i].astype(np.float64), len(written)).air()
@@ -244,16 +250,19 @@ def correct(
 
 class Normalisation:
     """What is brought to 1 in each frame, by `options`; what: its name; light: by air, where that is it; pattern: the
-    faults [H, W] of all frames that are divided out, too; divided: least and greatest number of what frames were."""
+    faults [H, W] of all frames that are divided out, too; divided: least and greatest number of what frames were;
+    beside: the frames before, beside each other."""
 
     def __init__(self, fielding: FlatFielding, options: CorrectionOptions) -> None:
         """Looks at all projections once where air may be found; `InputError` where it is asked for in vain."""
-        self._path, wanted = fielding.file.path, options.normalise
+        self._path, wanted, numbers = fielding.file.path, options.normalise, fielding.file.numbers(PROJECTION)
+        self._numbers, still = numbers, len(np.unique(fielding.file.exposures.time)) == 1
+        self.beside = Beside(fielding.file.label, still, fielding.light)
+        self._flats = fielding.brightness
         self.light: AirLight | None = None
         self.divided = (np.inf, 0.0)
         asked, look = wanted == "air" or bool(options.air), None
         if asked or wanted is None:
-            numbers = fielding.file.numbers(PROJECTION)
             look = Look.at(lambda i: fielding(int(numbers[i])), len(numbers))
             self.light = AirLight.of(look, options.air, asked)
         require(
@@ -262,17 +271,27 @@ class Normalisation:
         )
         changes = fielding.eigen is not None and len(fielding.eigen) > 0
         matter = look is not None and (look.air() is not None or look.has_bright_border())
+        if self.light and look and not asked and not look.has_matter_beside_air():
+            small = (look.frames.shape[1], look.frames.shape[2])
+            levels = [self.light.factor(i, small).mean() for i in range(len(look.frames))]
+            self.light = None if self._is_dimmed(levels) else self.light
+        matter = matter or (look is not None and self._is_dimmed(look.frames.mean(axis=(1, 2))))
         otherwise: Normalise = "mean" if changes and not matter else "none"
         self.what: Normalise = "air" if self.light else wanted or otherwise
         self.pattern = np.ones((1, 1))
         if options.rings is not None:
-            numbers = fielding.file.numbers(PROJECTION)
             self.pattern = fixed_pattern(
                 lambda i: self._evened(i, fielding(int(numbers[i]))), len(numbers), options.rings
             )
 
+    def _is_dimmed(self, levels: Sequence[float] | np.ndarray) -> bool:
+        """Whether the levels [V] of all frames are farther off 1 than `FAR`, and than flats differ: by matter, then."""
+        low, high = min(1 - FAR, *self._flats), max(1 + FAR, *self._flats)
+        return bool(np.max(levels) < low or np.min(levels) > high)
+
     def __call__(self, number: int, frame: np.ndarray) -> np.ndarray:
         """The frame [H, W] of projection `number`, normalised."""
+        self.beside.add(int(self._numbers[number]), frame)
         return self._evened(number, frame) / self.pattern
 
     def _evened(self, number: int, frame: np.ndarray) -> np.ndarray:

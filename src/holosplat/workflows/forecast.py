@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from ..checks import InputError, as_written, positive, require
+from ..fit.run import Journal, Run
 from ..io.atomic import write_rows
 from ..io.json import write_json
 from ..io.nxtomo import write_scan
@@ -27,7 +28,7 @@ from ..representations import MovingSurfaces
 from ..scan import Scan
 from ..tables import read_rows, to_table
 from .evaluate import render_object
-from .provenance import environment, scan_hash
+from .provenance import RUN, scan_hash
 from .reconstruction import Reconstruction, summary_of
 from .run_folder import RunFolder
 from .run_illumination import light_of
@@ -109,6 +110,12 @@ def tracked_bodies(run: Reconstruction) -> MovingSurfaces:
     return run.object
 
 
+def require_cells(run: Reconstruction, times: np.ndarray, options: ForecastOptions) -> None:
+    """`InputError` where mechanics have no cell to carry on after the tracked `times` [T] s, before any fit."""
+    if options.dynamics is not None:
+        window_of(tracked_bodies(run), times, options.ahead(times), options.dynamics, options.model)
+
+
 def forecast(
     run: Reconstruction,
     scan: Scan,
@@ -116,12 +123,14 @@ def forecast(
     options: ForecastOptions = ForecastOptions(),
     seed: int = 0,
     *,
+    journal: Journal | None = None,
     on_progress: FitProgress = lambda stage, fraction, record: None,
 ) -> Forecasted:
     """What the bodies of `run`, tracked at `times` [T] s, and their holograms are expected to be afterwards.
 
-    scan: of the run, and of later times where it has them: these judge the forecast, and are used for nothing else.
-    Errors: `InputError` for runs that are not of `track`, and for a scan without the run's last time.
+    scan: of the run, and of later times where it has them: these judge the forecast, and are used for nothing else;
+    journal: keeps the fits. Errors: `InputError` for runs that are not of `track`, and for a scan without the run's
+    last time.
     """
     bodies, times = tracked_bodies(run), np.asarray(times, dtype=np.float64)
     ahead = options.ahead(times)
@@ -129,7 +138,7 @@ def forecast(
     known = scan[np.flatnonzero(scan.exposures.time <= times[-1] + slack)] if len(scan) else scan
     last = np.flatnonzero(np.abs(scan.exposures.time - times[-1]) <= slack)
     require(len(last) > 0, f"the scan must have frames of the run's last time, {times[-1]:.6g} s, but it has none.")
-    halves = _halves(run, known, bodies, options, seed, on_progress) if options.half_sets else None
+    halves = _halves(run, known, bodies, options, seed, Run(journal), on_progress) if options.half_sets else None
     on_progress("forecast", 0.0, {})
     flow = dict[str, float]()
     if options.dynamics is None:
@@ -163,15 +172,14 @@ def flow_in_words(flow: dict[str, float]) -> str:
     return said + "; of the membrane's viscosity it says nothing"
 
 
-def write_forecast(folder: RunFolder, run: Reconstruction, found: Forecasted, config: dict[str, Any]) -> Reconstruction:
+def write_forecast(folder: RunFolder, run: Reconstruction, found: Forecasted) -> Reconstruction:
     """The run folder of a forecast: bodies.pvd, tracks.csv and object.h5 as track writes them, at the times ahead;
     forecast.nxs, the predicted frames; forecast.csv, the band of each body; forecast.json, all numbers.
 
-    config: entries of config.json, from `config_of`. Returns the bodies as a reconstruction.
+    The run has begun with `config_of`. Returns the bodies as a reconstruction.
     """
     said = found.forecast
     done = replace(run, object=said.bodies, method=ForecastOptions.kind, timing={}, verdict=None, total=None)
-    folder.begin(config | environment("cpu"))
     write_object(folder.object, said.bodies, folder.marks())
     told = {"steps": 0, "times_s": said.times.tolist(), "bodies": said.bodies.count}
     folder.write_summary(summary_of(done, None, found.predicted) | told)
@@ -201,7 +209,10 @@ def config_of(options: ForecastOptions, scan: Scan, run: dict[str, Any], seed: i
     """Entries of config.json. run: that of the run whose future is predicted."""
     return {
         "schema_version": SCHEMA,
-        "method": {"kind": options.kind, "forecast": (options.dynamics or options.model).kind, **to_table(options)},
+        "method": {
+            **{"kind": options.kind, "of": run.get(RUN, ""), "forecast": (options.dynamics or options.model).kind},
+            **to_table(options),
+        },
         "seed": seed,
         "prior": run["prior"],
         "light": run.get("light", {}),
@@ -216,20 +227,20 @@ def _halves(
     bodies: MovingSurfaces,
     options: ForecastOptions,
     seed: int,
+    kept: Run,
     on_progress: FitProgress,
 ) -> Halves | None:
     """Fits to halves of the training frames; None for too few times."""
     train, part = _evened(run, known)
     if len(train.instants) < LEAST:
         return None
-    total = 2 * options.fit.schedule.steps
-    done = [0]
+    steps, before = options.fit.schedule.steps, [0.0, 0.0]
 
     def show(record: dict[str, float]) -> None:
-        done[0] += 1
-        on_progress("half-sets", done[0] / total, record)
+        before[0], before[1] = before[0] + (record["step"] < before[1]), record["step"]
+        on_progress("half-sets", 0.5 * (before[0] + record["step"] / steps), record)
 
-    return half_sets(train, bodies, options.fit, seed, part, rest=run.rest, on_record=show)
+    return half_sets(train, bodies, options.fit, seed, part, rest=run.rest, run=kept, on_record=show)
 
 
 def _evened(run: Reconstruction, known: Scan) -> tuple[Scan, Light | None]:

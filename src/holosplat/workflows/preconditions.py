@@ -66,7 +66,7 @@ def _require_same(folder: RunFolder, old: dict[str, Any], same: dict[str, Any]) 
         table.get("prior", {}).pop("medium", None)  # a name, which older versions did not keep
     for key, name in RESUMED_WITH.items():
         require(
-            old.get(key) == same[key],
+            key not in same or old.get(key) == same[key],
             f"--resume needs the {name} that {folder.path} was started with; use the same, or another --out.",
         )
 
