@@ -76,14 +76,14 @@ def test_matter_that_changes_is_taken_time_by_time(monkeypatch):
     """Other cells at every second time; without flow and bodies, which take long."""
     monkeypatch.setattr(motion_choice, "reconstruct_moving", lambda *args, **how: None)
     monkeypatch.setattr(motion_choice, "track", lambda part, *args, **how: missing(part))
-    decision = choose_motion(moving(5, (1, 4, 1, 4, 1)), known(20.0), QUICK, matter="levels")
+    decision = choose_motion(moving(6, (1, 4, 1, 4, 1, 4)), known(20.0), QUICK, matter="levels")
     assert decision.choice == "each"
     assert decision.compared[0].loses
     assert [each.name for each in decision.compared] == ["still", "flow", "bodies"]
 
 
 def test_few_times_and_few_frames_are_refused(scan):
-    with pytest.raises(InputError, match="needs 5 of them or more, but the scan has 4"):
+    with pytest.raises(InputError, match="needs 6 of them or more, but the scan has 4"):
         choose_motion(moving(4), known(20.0))
     single = scan[np.flatnonzero(np.tile(np.arange(4) == 0, TIMES))]
     with pytest.raises(InputError, match="a time has one training frame"):

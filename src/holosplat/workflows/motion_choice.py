@@ -23,8 +23,8 @@ from .track import reconstruct_moving, track
 
 Motion = Literal["each", "still", "flow", "bodies"]
 MOTION, BY = "motion", "times set aside"
-LOOKED_AT, FEWEST = 3, 5
-"""Times that are set aside, at most; and times from which on some can be."""
+LOOKED_AT, FEWEST = 3, 6
+"""Times that are set aside, at most; and times from which on some can be, for a flow needs three others."""
 
 Way = Callable[[Scan], Object | None]
 """Matter at all times from the frames of some; None where there is none of this kind."""
