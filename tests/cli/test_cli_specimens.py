@@ -14,7 +14,7 @@ from holosplat.io.nxtomo import read_scan
 from holosplat.io.volumes import read_volume
 from holosplat.io.vtk import read_meshes
 from holosplat.materials import parse_material
-from holosplat.specimens.matter import MATTER
+from holosplat.specimens.matter import CHANGING, MATTER
 
 FIELD: list[object] = ["--detector", 21, 30, "--pixel-size", "2e-6", "--views", 4]
 
@@ -222,9 +222,29 @@ def test_every_kind_that_may_fill_the_field_is_generated(kind, tmp_path):
     assert np.abs(volume.delta).max() > 4e-8
 
 
+@pytest.mark.parametrize("kind", CHANGING)
+def test_every_kind_that_changes_is_generated_at_its_times(kind, tmp_path):
+    """The first and the last time differ, and so do their truths and named parts; an exposure may be long."""
+    scan, truth = tmp_path / "s.nxs", tmp_path / "t.h5"
+    timed = ["--frame-rate", 1000, "--frames", 2, "--exposure", "1e-4", "--pulses", 2, "--truth-frames", 0, 1]
+    ran(
+        *("simulate", "--specimen", kind, *FIELD[:-1], 1, "--test-every", 0, *timed, "--out", scan),
+        *("--truth", truth, "--truth-regions"),
+    )
+    found = read_scan(scan)
+    assert found.instants == pytest.approx([0.0, 1e-3])
+    assert abs(found.frames[1] - found.frames[0]).max() > 0.01
+    volumes = [read_volume(tmp_path / f"t_t000{n}.h5").delta for n in range(2)]
+    assert abs(volumes[1] - volumes[0]).max() > 2e-8
+    for n in range(2):
+        (part,) = tmp_path.glob(f"t_t000{n}_*.h5")
+        assert 0.5 < read_volume(part).delta.max() < 1.001
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
+        (["--specimen", "collapse"], "collapse moves; give --frame-rate"),
         (["--specimen", "jet", "--specimen-set", "wall=0.1"], "the setting wall is not known; use one of size, count"),
         (["--specimen", "jet", "--specimen-set", "amplitude=0.9"], "amplitude must be below 0.7"),
         (["--specimen", "jet", "--core", "iron"], "--core is not of the jet"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -30,11 +31,11 @@ def known(energy_kev: float) -> MaterialPrior:
     return MaterialPrior.known(HAEMOGLOBIN.delta_beta(energy_kev))
 
 
-def moving(times: int) -> Scan:
-    """Four views of each time, the last of them held out."""
-    cells = random_cells(2, (SHAPE[1] * PIXEL, SHAPE[0] * PIXEL, SHAPE[1] * PIXEL), 1, 10 * PIXEL)
-    step = np.array([0.2, 0.0, 0.1]) * PIXEL
-    at = [[TriangleMesh(cell.vertices + k * step, cell.faces, cell.name) for cell in cells] for k in range(times)]
+def moving(times: int, seeds: Sequence[int] = ()) -> Scan:
+    """Four views of each time, the last of them held out; seeds: of the cells at each time (default: the same)."""
+    box, step = (SHAPE[1] * PIXEL, SHAPE[0] * PIXEL, SHAPE[1] * PIXEL), np.array([0.2, 0.0, 0.1]) * PIXEL
+    cells = [random_cells(2, box, seed, 10 * PIXEL) for seed in seeds or (1,) * times]
+    at = [[TriangleMesh(c.vertices + k * step, c.faces, c.name) for c in those] for k, those in enumerate(cells)]
     truth = MeshSeries(tuple(MeshScene.of_one_material(cells, CELL) for cells in at), 0.5 * np.arange(times))
     exposures = Exposures.of(Views.evenly_spaced(4, SHAPE, PIXEL), 20.0, 0.1).repeated(truth.times)
     return simulate(truth, exposures, is_test=np.tile(np.arange(4) == 3, times))

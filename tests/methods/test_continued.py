@@ -19,7 +19,7 @@ from holosplat.mesh import TriangleMesh
 from holosplat.methods import Auto, Gaussians, SmoothVolume, Surfaces, Task
 from holosplat.methods.continued import Continued, Effort
 from holosplat.methods.illumination import prepared
-from holosplat.methods.method import run_quietly
+from holosplat.methods.method import run_quietly, run_stages
 from holosplat.representations import Stored, SurfaceMesh, VoxelGrid, approximate, cloud_from_volume
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.red_cells import icosphere
@@ -69,13 +69,23 @@ def middle(found) -> np.ndarray:
     return np.array([(delta * v).sum() for v in (x, y, z)]) / delta.sum()
 
 
+ROUNDS = ("round 2 of the fit", "round 3 of the fit")
+
+
+def seen(method: Continued, task: Task, last: list) -> list[tuple[str, Stored]]:
+    """The states of a run, the last one also in `last`."""
+    states = []
+    last[:] = [run_stages(method, task, lambda name, found, *rest: states.append((name, found))).object]
+    return states
+
+
 @pytest.mark.parametrize(("kind", "left"), [("surfaces", 0.1), ("gaussians", 0.5), ("voxels", 0.5)])
 def test_matter_follows_its_frames_in_few_steps(scan, tmp_path, kind, left):
     """Of the way that the ball has gone, at most the share `left` is left; it began with what the other run found."""
     write_object(tmp_path / "object.h5", before(kind))
     method = Continued.of(Auto(), tmp_path / "object.h5")
     task = prepared(Task(scan, MaterialPrior.known(MATERIAL)))
-    (stage,) = method.stages()
+    stage = method.stages()[0]
     start = stage.start(task, None)
     assert middle(start) == pytest.approx(0, abs=0.02)
     fit = stage.fit(task, start)
@@ -83,6 +93,18 @@ def test_matter_follows_its_frames_in_few_steps(scan, tmp_path, kind, left):
     found = run_quietly(fit, lambda share: None, Stored)
     assert found.kind == start.kind
     assert np.linalg.norm(middle(found) - MOVED) < left * np.linalg.norm(MOVED)
+
+
+def test_rounds_follow_each_other_as_long_as_they_are_of_use(scan, tmp_path):
+    """Short ones of a ball that has moved: as many as there may be. Of one that has not: one, which is of no use."""
+    write_object(tmp_path / "moved.h5", before("gaussians"))
+    task = prepared(Task(scan, MaterialPrior.known(MATERIAL)))
+    ways, last = Continued.of(Auto(), tmp_path / "moved.h5", Effort(3, gaussians=6)), []
+    assert [name for name, _ in seen(ways, task, last)] == ["start", "fit from before", *ROUNDS]
+    seen(Continued.of(Auto(), tmp_path / "moved.h5", Effort(3, gaussians=80)), task, last)
+    write_object(tmp_path / "right.h5", last[0])
+    again = seen(Continued.of(Auto(), tmp_path / "right.h5", Effort(3, gaussians=4)), task, last)
+    assert [name for name, _ in again] == ["start", "fit from before"]
 
 
 def test_methods_hand_their_options_on():

@@ -22,9 +22,9 @@ from holosplat.report.page import Headline
 from holosplat.representations import MovingSurfaces
 from holosplat.series.collect import collect, same_bodies
 from holosplat.series.folder import SeriesFolder, duration, table_of, time_left
+from holosplat.series.one_time import PHASE
 from holosplat.series.page import Frame, Point, SeriesPage, chart, headline, labels, render_page
 from holosplat.series.run import run_left, states
-from holosplat.series.task import PHASE
 from holosplat.workflows.reconstruction import Reconstruction
 
 

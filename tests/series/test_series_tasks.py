@@ -14,14 +14,15 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.series import SETTINGS, planned
+from helpers.series import moving, planned
 from holosplat.checks import InputError
 from holosplat.io.lock import TakenError, sole_writer
+from holosplat.io.nxtomo import write_scan
 from holosplat.io.objects import read_object
 from holosplat.methods import HolographicVoxels
 from holosplat.methods.continued import Continued
-from holosplat.series import task as series_time
-from holosplat.series.folder import SeriesFolder
+from holosplat.series import one_time as series_time
+from holosplat.series.folder import SeriesFolder, line_of, verdict_of
 from holosplat.series.plan import Settings
 from holosplat.series.run import run_left, states
 from holosplat.series.task import attempted, run_task
@@ -143,16 +144,58 @@ def test_what_fails_is_said_and_tried_again(files, tmp_path, monkeypatch):
         assert replace(row, seconds=0.0) == replace(wanted, seconds=0.0)
 
 
-def test_a_warm_start_that_is_not_enough_begins_anew(done, files, tmp_path, monkeypatch):
-    """Where frames are not explained, and clearly more matter is left than when a time last began by itself."""
-    monkeypatch.setattr(series_time, "_explained", lambda result: False)
-    settings = replace(SETTINGS, warm=replace(SETTINGS.warm, worse=1e-3))
-    folder = planned(tmp_path / "series", files.scan, settings=settings)
+def test_a_good_state_is_not_thrown_away(done, files, tmp_path, monkeypatch):
+    """Both starts are tried where the warm one seems worse, and the better one is kept: here the warm one, for the
+    start by itself finds other matter."""
+    real, other = series_time.reconstruct, moving(1, seeds=(4,)).as_static()
+    monkeypatch.setattr(series_time, "_as_good", lambda left, reference: False)
+    monkeypatch.setattr(
+        series_time,
+        "reconstruct",
+        lambda scan, *args, folder, **how: real(
+            other if folder.path.suffix == ".cold" else scan, *args, folder=folder, **how
+        ),
+    )
+    folder = planned(tmp_path / "series", files.scan)
     run_task(folder, 0)
     rows = folder.rows(folder.plan().windows()[0])
+    assert [row.begun for row in rows] == ["cold", "warm"]
+    assert rows[1].decided.startswith("begun: warm (training frames: warm +")
+    assert rows[1].decided in line_of(rows[1])
+    assert same(arrays(folder, 0, 1), arrays(done, 0, 1))
+    assert not folder.run(0, 1).with_name("t0001.cold").exists()
+
+
+def test_other_matter_begins_anew(files, tmp_path):
+    """The second time shows other cells: what warm leaves of it is compared, and the start by itself is kept. What was
+    cut off after that goes on to the same row."""
+    scan = tmp_path / "other.nxs"
+    write_scan(scan, moving(2, seeds=(1, 4)))
+    folder = planned(tmp_path / "series", scan)
+    run_task(folder, 0)
+    window = folder.plan().windows()[0]
+    rows = folder.rows(window)
     assert [row.begun for row in rows] == ["cold", "anew"]
-    assert rows[1].reference == rows[1].unexplained
+    assert rows[1].decided.startswith("begun: cold (training frames: warm ")
     assert RunFolder(folder.run(0, 1)).read_config()["method"]["kind"] == "gaussians"
+    assert not folder.run(0, 1).with_name("t0001.cold").exists()
+    for path in (folder.row(0, 1), folder.task(0) / "done.json"):
+        path.unlink()
+    run_task(folder, 0)
+    assert replace(folder.rows(window)[1], seconds=0.0) == replace(rows[1], seconds=0.0)
+
+
+def test_a_series_says_which_times_are_not_explained(done):
+    """On the terminal, in the table and on the page."""
+    rows = [row for window in done.plan().windows() for row in done.rows(window)]
+    assert verdict_of(rows) == ["the frames of 5 of 5 times are explained"]
+    rows[3] = replace(rows[3], good=False, words="The frames are not explained: why.")
+    assert verdict_of(rows) == [
+        "the frames of 1 of 5 times are not explained, do not trust them: 3",
+        "  time 3: The frames are not explained: why.",
+    ]
+    assert "NOT explained" in line_of(rows[3])
+    assert ", explained, " in line_of(rows[2])
 
 
 def test_a_scan_that_was_replaced_is_noticed(files, tmp_path):

@@ -31,8 +31,9 @@ from holosplat.specimens import (
     Substances,
 )
 from holosplat.specimens.fluids import FASTEST
-from holosplat.specimens.matter import MATTER
+from holosplat.specimens.matter import CHANGING, MATTER
 
+KINDS = {**MATTER, **CHANGING}
 PIXEL = 1e-6
 SIZE = 40e-6
 VIEWS = Views.from_angles([0.0, 50.0], (45, 57), PIXEL)
@@ -58,9 +59,9 @@ def meshes(found: Drawn, name: str) -> list:
     return [mesh for mesh in found.scene.meshes if mesh.name.startswith(name)]
 
 
-@pytest.mark.parametrize("name", MATTER)
+@pytest.mark.parametrize("name", KINDS)
 def test_a_kind_follows_its_seed_and_names_its_parts(name):
-    kind = MATTER[name](MATTER[name].extent * 45e-6)
+    kind = KINDS[name](KINDS[name].extent * 45e-6)
     first, again, other = (drawn(kind, seed) for seed in (1, 1, 2))
     assert np.array_equal(means(first.scene), means(again.scene))
     assert not np.array_equal(means(first.scene), means(other.scene))
@@ -76,10 +77,10 @@ def test_a_kind_follows_its_seed_and_names_its_parts(name):
     assert float(delta.std()) > 0
 
 
-@pytest.mark.parametrize("name", MATTER)
+@pytest.mark.parametrize("name", KINDS)
 def test_line_integrals_are_those_of_the_voxels(name):
     """In the view along z, where they are sums of voxels, in means over 3 × 3 pixels, for some bodies are thinner."""
-    kind = MATTER[name](0.8 * 45e-6)
+    kind = KINDS[name](0.8 * 45e-6)
     scene = drawn(kind, 3).scene
     views = VIEWS[[0]]
     depth = 201  # voxels along z, beyond the matter

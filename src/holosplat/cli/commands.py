@@ -37,9 +37,9 @@ if TYPE_CHECKING:
 class CarriedFlags:
     """How matter changes between the times of a scan."""
 
-    motion: Literal["still", "each", "flow", "bodies"] | None = None
+    motion: Literal["auto", "still", "each", "flow", "bodies"] | None = None
     """still: one object for all times; each: a run for each time; flow: one object that a flow carries; bodies: closed
-    bodies on paths, as `track` (default: one time)."""
+    bodies on paths, as `track`; auto: by times set aside (default: one time)."""
     fading: Weight = 0.0
     """Standard deviation expected of what the logarithm of δ changes by over all times, where matter fades or grows
     denser (0: it does not). About a third is a change by a third."""
@@ -52,7 +52,7 @@ class CarriedFlags:
             reading.part.time_frame is None,
             f"--motion {self.motion} takes all times, but --time-frame is {reading.part.time_frame}; leave one.",
         )
-        taken = {"still": "still", "each": "each", "flow": "all", "bodies": None}[self.motion]
+        taken = {"still": "still", "each": "each", "flow": "all"}.get(self.motion)
         return replace(reading, part=replace(reading.part, time_frame=taken))
 
     def options(self) -> FlowOptions:
@@ -147,6 +147,9 @@ def reconstruct(
     from ..workflows.run_folder import RunFolder, claimed
     from .track import asks_for_motion, may_go_on, reconstruct_in_motion
 
+    if asked.motion.motion == "auto":
+        require(not resume, "--motion auto decides anew; go on with the --motion that it chose and --resume.")
+        asked = _with_motion(scan, asked, reading, seed)
     method, reading = asked.how.chosen(), asked.motion.applied(reading)
     asked.motion.require_all(reading)
     if asked.motion.motion == "bodies" or reading.part.time_frame == "each":
@@ -180,6 +183,22 @@ def reconstruct(
     put(evaluation.lines())
     _print_result(folder, result, report)
     _end(result, out, strict)
+
+
+def _with_motion(scan: Path, asked: Asked, reading: Reading, seed: int) -> Asked:
+    """What is asked, with the motion that frames choose."""
+    from ..io.formats import read_frames
+    from ..workflows.motion_choice import choose_motion
+
+    asked.motion.applied(reading)  # which refuses a time
+    settings = asked.each_time(asked.how.chosen(), reading, seed)
+    measured = read_frames(scan, reading).in_memory()
+    prior = asked.matter.prior(measured.exposures.reference_energy)
+    how = {"light": settings.light, "matter": settings.matter}
+    decision = choose_motion(measured, prior, settings.method, seed, **how)
+    say(decision.line)
+    chosen = {each: each for each in ("still", "each", "flow", "bodies")}[decision.choice]
+    return replace(asked, motion=replace(asked.motion, motion=chosen))
 
 
 def _time_by_time(scan: Path, out: Path, asked: Asked, reading: Reading, seed: int, resume: bool) -> None:

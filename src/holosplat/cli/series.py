@@ -13,9 +13,9 @@ from ..checks import require
 from ..io.formats import read_frames
 from ..io.reading import Reading
 from ..matter import MaterialPrior
-from ..ranges import Jobs, Positive, Seed, ranged
+from ..ranges import Jobs, Seed, ranged
 from ..series.collect import collect as join
-from ..series.folder import Row, SeriesFolder, line_of, some, table_of, time_left
+from ..series.folder import Row, SeriesFolder, line_of, some, table_of, time_left, verdict_of
 from ..series.plan import Cut, Settings, Slurm, Warm, plan_series
 from ..series.run import run_left
 from ..series.watch import Watch, WatchFolder, Watching
@@ -40,10 +40,8 @@ class EachTime:
     """What is done with each time."""
 
     warm: bool = True
-    """Begin each time with what the one before ended with, with fewer steps; where that does not explain its frames, it
-    begins anew, by itself. --no-warm: each begins by itself."""
-    worse: Positive = 1.25
-    """Factor of the matter left unexplained, over that of the last time begun alone, beyond which it begins anew."""
+    """Begin each time with what the one before ended with, with fewer steps. Where that leaves more of the frames than
+    the last time begun alone did, it is also begun by itself, and the better one is kept. --no-warm: each begins so."""
     reports: bool = False
     """Write report.html of each run, too, which takes seconds a time."""
 
@@ -66,7 +64,7 @@ class Act:
         shared = {"light": self.illumination.options(), "seed": seed, "reports": self.each.reports}
         if track:
             return Settings("track", motion=replace(self.motion.options(), body=self.known.known()), **shared)
-        warm = Warm(self.each.warm, self.each.worse)
+        warm = Warm(self.each.warm)
         return Settings("reconstruct", self.how.chosen(), self.how.kind_of_matter(), warm, **shared)
 
 
@@ -218,6 +216,7 @@ def collect(folder: Positional[Path]) -> None:
     found = join(series := SeriesFolder(folder))
     for path in (series.table, series.bodies, series.page):
         say(f"wrote {path}")
+    put(verdict_of([row for row in found.rows if row is not None]))
     if found.missing:
         say(f"{len(found.missing)} of {len(found.moments)} times are missing: {some(found.missing)}")
         raise SystemExit(UNFINISHED)
@@ -263,7 +262,7 @@ def reconstruct_each(
         folder.create(planned)
     with interruptible(lambda: f"interrupted; go on with --out {out} --resume"):
         counts = run_left(folder, retry=True, on_row=_tell_row)
-    join(folder)
+    put(verdict_of([row for row in join(folder).rows if row is not None]))
     say(f"wrote {folder.table}, {folder.page}; each time is a run folder in {folder.task(0)}")
     if counts.failed or counts.left:
         raise SystemExit(UNFINISHED)

@@ -36,13 +36,13 @@ if TYPE_CHECKING:
     from ..scan import Exposures
     from ..specimens.carried import CarriedScene
     from ..specimens.continuous import ContinuousScene
-    from ..specimens.drawn import Drawn
+    from ..specimens.drawn import ChangingScene, Drawn
     from ..specimens.mesh_series import MeshSeries
     from ..specimens.rods import RodScene
     from ..specimens.scene import MeshScene, VoxelScene
     from ..volume import Object
 
-    Still = MeshScene | ContinuousScene | VoxelScene | CarriedScene | RodScene
+    Still = MeshScene | ContinuousScene | VoxelScene | CarriedScene | RodScene | ChangingScene
 
 
 @dataclass(frozen=True)
@@ -87,12 +87,16 @@ class TruthOptions:
         named = [(of_time(self.truth, frame), frame) for frame in self.truth_frames]
         return named or [(self.truth, 0)]
 
-    def of_regions(self, regions: Mapping[str, Object]) -> dict[Path, Object]:
-        """Each volume file of a named part to write, and the part; `InputError` where they are wanted of none."""
-        if self.truth is None or not self.truth_regions:
+    def of_regions(
+        self, regions: Mapping[str, Object], volumes: list[tuple[Path, int]]
+    ) -> dict[Path, tuple[Object, int]]:
+        """Each volume file of a named part to write beside those of all matter, the part, and the number of its time;
+        `InputError` where they are wanted of none."""
+        if not self.truth_regions:
             return {}
         require(len(regions) > 0, "--truth-regions is of matter that may fill the field (--specimen); leave it.")
-        return {self.truth.with_stem(f"{self.truth.stem}_{name}"): one for name, one in regions.items()}
+        every = regions.items()
+        return {path.with_stem(f"{path.stem}_{name}"): (one, n) for path, n in volumes for name, one in every}
 
     def write_mesh(self, matter: object) -> bool:
         """The surfaces of `matter` to the STL file, if one is wanted; `InputError` where there are none."""
@@ -190,7 +194,7 @@ def simulate(
     facts = {**how.provenance(true), **specimen.facts, **of_source, "medium": named.medium or "vacuum"}
     if imaged.generated.specimen is not None and named.material is not None:
         facts["material"] = named.material
-    regions, targets = truth.of_regions(specimen.regions), [(out, nominal, facts)]
+    regions, targets = truth.of_regions(specimen.regions, volumes), [(out, nominal, facts)]
     if truth.true_exposures:
         targets.append((truth.true_exposures, true, facts | experiment.misalignment.facts()))
     tell_simulation(true_views, out, how.samples(true_views), len(true))
@@ -205,8 +209,8 @@ def simulate(
     for path, frame in volumes:
         _write_truth(path, specimen.matter.at(times[frame]), views.views)
         say(f"wrote {path}: the true volume{f' at {times[frame]:.6g} s' if motion.frame_rate else ''}")
-    for path, region in regions.items():
-        _write_truth(path, region, views.views)
+    for path, (region, frame) in regions.items():
+        _write_truth(path, region.at(times[frame]), views.views)
         say(f"wrote {path}: the share of each voxel that this part fills")
 
 

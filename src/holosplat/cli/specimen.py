@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 from tyro.conf import UseAppendAction, arg
 
@@ -22,14 +22,15 @@ if TYPE_CHECKING:
     from ..scan import Exposures
     from ..specimens.carried import CarriedScene
     from ..specimens.continuous import ContinuousScene
+    from ..specimens.drawn import ChangingScene, Drawn
+    from ..specimens.matter import Changing as ChangingMatter
+    from ..specimens.matter import FieldMatter
     from ..specimens.mesh_series import MeshSeries
     from ..specimens.rods import RodScene
     from ..specimens.scene import MeshScene, VoxelScene
 
-    Still = MeshScene | ContinuousScene | VoxelScene | CarriedScene | RodScene
-    from ..specimens.drawn import Drawn
-    from ..specimens.matter import FieldMatter
-    from ..specimens.scene import VoxelScene
+    Still = MeshScene | ContinuousScene | VoxelScene | CarriedScene | RodScene | ChangingScene
+    AnyMatter = FieldMatter | ChangingMatter
 
 NO_SPECTRUM = (
     "a spectrum needs meshes of files, whose materials are known at every energy; leave --bandwidth and --spectrum out."
@@ -126,7 +127,10 @@ InField = Literal[
     "star",
 ]
 """The kinds of `specimens.MATTER`."""
-MOVING: tuple[Moving, ...] = ("stirred-blob", "collapsing-foam")
+Changing = Literal["merging-drops", "collapse", "pinching-jet", "expanding-shock", "crushed-lattice"]
+"""The kinds of `specimens.CHANGING`."""
+CARRIED: tuple[Moving, ...] = ("stirred-blob", "collapsing-foam")
+MOVING: tuple[Moving | Changing, ...] = (*CARRIED, *get_args(Changing))
 CORED = ("coated-droplets", "body-with-absorber")
 USUAL_COUNT = 9
 """Cells or droplets unless --specimen-count says otherwise."""
@@ -171,7 +175,7 @@ class VolumeOptions:
 class GeneratedOptions:
     """Matter that is generated, in place of files."""
 
-    specimen: Soft | Moving | InField | None = None
+    specimen: Soft | Moving | Changing | InField | None = None
     """Kind of specimen (docs/simulation.md)."""
     specimen_size: Small | None = None
     """Its extent [m] (default: 0.85 of the shorter side of the field of view, or as its kind has it)."""
@@ -220,14 +224,14 @@ class GeneratedOptions:
         material, _, medium = kind.named
         return replace(filling, material=filling.material or material, medium=filling.medium or medium)
 
-    def in_field(self, beamline: BeamlineOptions) -> FieldMatter | None:
+    def in_field(self, beamline: BeamlineOptions) -> AnyMatter | None:
         """The matter that may fill the field, with its parameters; None for other specimens."""
         from ..tables import overridden
 
         kind = self._kind()
         require(
-            self.specimen_motion is None or self.specimen in MOVING,
-            f"--specimen-motion is of {' and '.join(MOVING)}, not of {self.specimen}; leave it.",
+            self.specimen_motion is None or self.specimen in CARRIED,
+            f"--specimen-motion is of {' and '.join(CARRIED)}, not of {self.specimen}; leave it.",
         )
         of_bubbles = self.specimen_radii is not None or self.specimen_overlap
         require(
@@ -280,10 +284,11 @@ class GeneratedOptions:
         inside = None if core is None else parse_material(core, self.core_density).delta_beta(energy)
         return found.drawn(Substances(material, inside, medium), self.specimen_seed)
 
-    def _kind(self) -> type[FieldMatter] | None:
-        from ..specimens.matter import MATTER
+    def _kind(self) -> type[AnyMatter] | None:
+        from ..specimens.matter import CHANGING, MATTER
 
-        return None if self.specimen is None else MATTER.get(self.specimen)
+        kinds: dict[str, type[AnyMatter]] = {**MATTER, **CHANGING}
+        return None if self.specimen is None else kinds.get(self.specimen)
 
     def scene(
         self, beamline: BeamlineOptions, filling: Filling, duration: float = 0.0
@@ -351,7 +356,7 @@ class SpecimenOptions:
         if self.generated.specimen is not None:
             require(not paths, "--specimen generates what is imaged; give it or files, not both.")
             if self.generated.in_field(beamline) is not None:
-                return self.generated.drawn(beamline, filling)
+                return self.generated.drawn(beamline, filling).over(duration or 1.0)
             return self.generated.scene(beamline, filling, duration)
         require(len(paths) > 0, "simulate needs mesh files, a volume, or --specimen.")
         if not of_volume:

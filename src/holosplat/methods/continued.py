@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import ClassVar
 
 from ..checks import InputError, require
 from ..fit.loop import Fit
+from ..inference import Compared, Score
 from ..io.objects import read_object
 from ..ranges import Natural, Positive, ranged
 from ..representations import GaussianCloud, Stored, SurfaceMesh, VoxelGrid
 from .auto import Auto
+from .cross_validation import predicted_frames
 from .gaussians import Gaussians, GaussianStage
 from .method import Method, Stage, Task
 from .smooth_fit import SmoothFit
@@ -26,15 +29,17 @@ from .volume import SmoothStage, SmoothVolume
 class Effort:
     """How long a fit that goes on takes: matter has moved by a pixel or less, and is else as it was."""
 
+    rounds: Natural = 2
+    """Rounds at most; another follows where the last one explains the frames better by the policy of `Compared`. Where
+    the last one still does, matter has changed by more than that."""
     surfaces: Natural = 20
-    """Steps of surfaces, which take 100 from a start of Gaussians: of cells that had moved by 0.3 pixels, 15, 30 and 60
-    leave the same unexplained, to 1 part in 300."""
+    """Steps of surfaces in a round, which take 100 from a start of Gaussians."""
     gaussians: Natural = 30
-    """Steps of Gaussians."""
+    """Steps of Gaussians in a round."""
     faster: Positive = 4.0
     """Factor of the rate of their centres: at the usual one they go a third of a pixel in so many steps."""
     volume: Natural = 8
-    """Iterations of a smooth volume on voxels of a pixel, in one round."""
+    """Iterations of a smooth volume on voxels of a pixel in a round."""
 
 
 @dataclass(frozen=True)
@@ -73,19 +78,25 @@ class Continued(Method):
         return False
 
     def stages(self) -> Sequence[Stage]:
-        """One: what the other run found, and the fit."""
-        return (ContinuedStage(self),)
+        """What the other run found, and rounds of its fit."""
+        left = list[Score]()
+        names = ("fit from before", *(f"round {n} of the fit" for n in range(2, self.effort.rounds + 1)))
+        return tuple(ContinuedStage(self, name, left) for name in names)
 
 
 @dataclass(frozen=True)
 class ContinuedStage:
-    """The fit of what another run found."""
+    """A round of the fit of what another run found. left: what states before the rounds leave of the frames, shared by
+    all rounds."""
 
     options: Continued
-    name: str = "fit from before"
+    name: str
+    left: list[Score]
 
     def start(self, task: Task, before: Stored | None) -> Stored:
-        """The object of the other run. Errors: `InputError` for one of another field or kind."""
+        """The object of the other run, or of the round before. Errors: `InputError` for another field or kind."""
+        if before is not None:
+            return before
         found = read_object(self.options.begin)
         require(
             isinstance(found, SurfaceMesh | GaussianCloud | VoxelGrid),
@@ -94,8 +105,12 @@ class ContinuedStage:
         )
         return found
 
-    def fit(self, task: Task, start: Stored) -> Fit | SmoothFit:
-        """The fit to the training frames, of few steps."""
+    def fit(self, task: Task, start: Stored) -> Fit | SmoothFit | None:
+        """The fit to the training frames, of few steps; None where the round before was of no use."""
+        self.left.append(Score.of(task.scan.left(predicted_frames(task.scan.exposures, start))))
+        gains = [Compared(self.name, *after.gain_over(before)).wins for before, after in pairwise(self.left)]
+        if not all(gains):
+            return None
         options, effort = self.options, self.options.effort
         if isinstance(start, SurfaceMesh):
             fit = options.surfaces.fit

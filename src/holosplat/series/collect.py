@@ -13,8 +13,8 @@ from scipy.optimize import linear_sum_assignment
 from ..io.atomic import write_rows
 from ..tables import number_in
 from .folder import Body, Row, SeriesFolder, TaskState, plain, time_left
+from .one_time import PHASE
 from .plan import Moment, SeriesPlan
-from .task import PHASE
 
 if TYPE_CHECKING:
     from .page import SeriesPage
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 COLUMNS = (
     *("number", "scan", "frame", "time_s", "task", "status", "begun", "kind", "explained", "unexplained"),
     *("test_ssim", "test_frcm", "train_ssim", "train_frcm", "total_m3", "total_error_m3", "bodies", "seconds"),
-    *("run", "reason"),
+    *("run", "reason", "decided", "verdict"),
 )
 BODY_COLUMNS = ("number", "time_s", "body", "x_m", "y_m", "z_m", "volume_m3")
 
@@ -151,12 +151,12 @@ def _lines(folder: SeriesFolder, found: Collected) -> Iterable[list[object]]:
         where: list[object] = [moment.number, source, moment.frame, f"{moment.time:.9g}", task]
         if row is None or not row.done:
             status = "failed" if row is not None else states[task].state.replace("done", "left")
-            yield [*where, status, *[""] * (len(COLUMNS) - 7), row.reason if row else states[task].reason]
+            yield [*where, status, *[""] * (len(COLUMNS) - 9), row.reason if row else states[task].reason, "", ""]
             continue
         scores = [_number(part.get(name)) for part in (row.test, row.train) for name in ("ssim", "frcm")]
         said = [row.begun, row.kind, "" if row.good is None else int(row.good), _number(row.unexplained), *scores]
         told = [_number(row.total), _number(row.total_error), len(row.bodies), f"{row.seconds:.3f}"]
-        yield [*where, "done", *said, *told, run.relative_to(folder.path).as_posix(), ""]
+        yield [*where, "done", *said, *told, run.relative_to(folder.path).as_posix(), "", row.decided, row.words]
 
 
 def _body_lines(found: Collected) -> Iterable[list[object]]:

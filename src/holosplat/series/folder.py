@@ -25,9 +25,10 @@ class Row:
     """One time. number: of the series; scan, frame, time_s: where it comes from.
 
     - status: `done`, or `failed` for the `reason` given
-    - begun: `cold`, by itself; `warm`, with what the time before ended with; `anew`, by itself, for warm was not enough
-    - kind, size: of the object; unexplained: share of the matter that training frames leave; reference: the same of the
-      last time that began by itself; good: whether frames are explained; words: that in a sentence
+    - begun: `cold`, by itself; `warm`, with what the time before ended with; `anew`, by itself, which was no worse than
+      warm; decided: by what evidence, where both were tried
+    - kind, size: of the object; unexplained: share of the matter that training frames leave; good: whether frames are
+      explained; words: that in a sentence
     - test, train: means over held-out and training frames: ssim, frcm, psnr [dB], l1; empty where there are none
     - quantity, total, total_error: the total of δ or β and its standard error [m³]
     - bodies: centre x, y, z [m] and volume [m³] of each closed body
@@ -41,10 +42,10 @@ class Row:
     status: Literal["done", "failed"]
     reason: str = ""
     begun: Begun = ""
+    decided: str = ""
     kind: str = ""
     size: str = ""
     unexplained: float | None = None
-    reference: float | None = None
     good: bool | None = None
     words: str = ""
     test: Mapping[str, Any] = field(default_factory=dict)
@@ -75,6 +76,8 @@ def read_row(path: Path) -> Row:
         return from_table(Row, values)
 
 
+MOST_TOLD = 5
+"""Verdicts told in full, at most."""
 LONGEST = 160
 """Characters of a reason in a table."""
 
@@ -94,8 +97,26 @@ def duration(seconds: float) -> str:
 
 def line_of(row: Row) -> str:
     """How a time went, in a line."""
-    said = f"{row.begun}, {row.size}, {row.seconds:.1f} s" if row.done else f"failed: {row.reason}"
-    return f"time {row.number}: {said}"
+    return f"time {row.number}: {outcome_of(row)}"
+
+
+def outcome_of(row: Row) -> str:
+    """How a time went: how it was begun, what it is, whether its frames are explained, and how long it took."""
+    if not row.done:
+        return f"failed: {plain(row.reason)}"
+    explained = {True: "explained", False: "NOT explained", None: "not judged"}[row.good]
+    decided = f"; {row.decided}" if row.decided else ""
+    return f"{row.begun}, {row.size}, {explained}, {row.seconds:.1f} s{decided}"
+
+
+def verdict_of(rows: Sequence[Row]) -> list[str]:
+    """Which times are not explained, and why; how many are, where all are."""
+    judged = [row for row in rows if row.done and row.good is not None]
+    bad = [row for row in judged if not row.good]
+    if not bad:
+        return [f"the frames of {len(judged)} of {len(rows)} times are explained"]
+    said = f"the frames of {len(bad)} of {len(rows)} times are not explained, do not trust them: "
+    return [said + some([row.number for row in bad]), *(f"  time {row.number}: {row.words}" for row in bad[:MOST_TOLD])]
 
 
 def some(numbers: Sequence[int], most: int = 12) -> str:

@@ -195,6 +195,7 @@ def _cells(frame: Frame) -> dict[str, object]:
         total + error,
         bodies,
         f"{row.seconds:.1f}",
+        in_print(row.words),
     ]
     return {"number": row.number, "run": frame.run, "cells": cells, "scan": Path(row.scan).name}
 

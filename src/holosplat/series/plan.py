@@ -20,7 +20,7 @@ from ..methods.continued import Continued, Effort
 from ..methods.presets import method_of
 from ..motion.track import TrackOptions
 from ..optics.background import LightOptions
-from ..ranges import Natural, Positive, Seed, ranged
+from ..ranges import Natural, Seed, ranged
 from ..scan import Scan
 from ..tables import from_table, to_table
 
@@ -199,9 +199,6 @@ class Warm:
 
     on: bool = True
     """Whether it does; else each time begins with phase retrieval and tomography."""
-    worse: Positive = 1.25
-    """Factor of the matter left unexplained, over that of the last time that began by itself, beyond which a time whose
-    frames are not explained begins anew, by itself."""
     effort: Effort = field(default_factory=Effort)
     """How long its fit takes."""
 

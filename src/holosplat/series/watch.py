@@ -25,9 +25,10 @@ from ..matter import MaterialPrior
 from ..ranges import Positive, Seconds, ranged
 from ..scan import Scan
 from ..workflows.run_folder import RunFolder
-from .folder import ROW, Row, plain, read_row, write_row
+from .folder import ROW, Row, outcome_of, plain, read_row, write_row
+from .one_time import PHASE, Before, Shot, reconstruct_time
 from .plan import Settings, at, times_of
-from .task import PHASE, Before, Shot, attempted, reconstruct_time
+from .task import attempted
 
 FORMAT = "holosplat watch 1"
 MARKER, SCAN, SCANS = "watch.json", "scan.json", "scans"
@@ -277,7 +278,7 @@ class Watch:
         write_row(self.folder.row(seen.number, frame), row)
         self._remember(run.path, row)
         name = plain(path.name) if len(times) == 1 else f"{plain(path.name)}, time {frame}"
-        self.say(f"{name}: {f'{row.begun}, {row.size}, {row.seconds:.1f} s' if row.done else plain(reason)}")
+        self.say(f"{name}: {outcome_of(row) if row.done else plain(reason)}")
 
     def _show(self, state: str, refresh: float) -> None:
         """Bring the page and the table up to date."""

@@ -2,11 +2,16 @@ from .carried import CarriedScene as CarriedScene
 from .carried import Twist as Twist
 from .carried import collapsing_foam as collapsing_foam
 from .carried import stirred_blob as stirred_blob
+from .changing import Collapse as Collapse
+from .changing import CrushedLattice as CrushedLattice
+from .changing import MergingDrops as MergingDrops
+from .changing import PinchingJet as PinchingJet
 from .continuous import Bump as Bump
 from .continuous import ContinuousScene as ContinuousScene
 from .continuous import Element as Element
 from .continuous import Soft as Soft
 from .continuous import ellipsoid as ellipsoid
+from .drawn import ChangingScene as ChangingScene
 from .drawn import Drawn as Drawn
 from .drawn import Substances as Substances
 from .flow.suspension import Medium as Medium
@@ -17,6 +22,7 @@ from .fluids import Bubbles as Bubbles
 from .fluids import Cuvette as Cuvette
 from .fluids import Jet as Jet
 from .fluids import Shock as Shock
+from .gas_waves import ExpandingShock as ExpandingShock
 from .membrane.model import Elasticity as Elasticity
 from .membrane.model import Membrane as Membrane
 from .membrane.model import stretch as stretch

@@ -12,20 +12,50 @@ they say otherwise, and `drawn(substances, seed)` gives a `Drawn`. Of its class 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ..checks import InputError, require
+from ..geometry import Grid, Views
 from ..matter import DeltaBeta
 from ..mesh import TriangleMesh
+from ..volume import LineIntegrals, Volume
 from .continuous import ContinuousScene
 from .phantoms import packed_balls
 from .rods import RodScene
 from .scene import MeshScene
 
-Scene = MeshScene | ContinuousScene | RodScene
+Still = MeshScene | ContinuousScene | RodScene
+
+
+@dataclass(frozen=True, eq=False)
+class ChangingScene:
+    """A truth that is drawn anew at every time. drawn: the scene at a share of the course, 0 at the first time and 1 at
+    the last, which are `duration` [s] apart."""
+
+    drawn: Callable[[float], Still]
+    duration: float = 1.0
+
+    def at(self, time: float) -> Still:
+        """The scene at `time` [s]."""
+        return self.drawn(time / self.duration)
+
+    def project(self, views: Views) -> LineIntegrals:
+        """Line integrals at the first time."""
+        return self.drawn(0.0).project(views)
+
+    def voxelise(self, grid: Grid) -> Volume:
+        """δ and β at the first time."""
+        return self.drawn(0.0).voxelise(grid)
+
+    def missing_field(self, views: Views) -> float:
+        """How far [m] the scene reaches beyond the detector in the worst view of the first, middle and last time."""
+        return max(self.drawn(share).missing_field(views) for share in (0.0, 0.5, 1.0))
+
+
+Scene = Still | ChangingScene
 """The truths that a kind may give."""
 LONG = 16.0
 """Length of what goes on beyond the field at its top or bottom, in units of the size."""
@@ -62,6 +92,14 @@ class Drawn:
     scene: Scene
     text: str
     regions: Mapping[str, Scene] = field(default_factory=dict)
+
+    def over(self, duration: float) -> Drawn:
+        """The same, with the course of what changes spread over `duration` [s]."""
+
+        def spread(scene: Scene) -> Scene:
+            return replace(scene, duration=duration) if isinstance(scene, ChangingScene) else scene
+
+        return replace(self, scene=spread(self.scene), regions={k: spread(one) for k, one in self.regions.items()})
 
 
 def meshed(parts: Sequence[tuple[Sequence[TriangleMesh], DeltaBeta]]) -> MeshScene:

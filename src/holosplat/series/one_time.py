@@ -1,0 +1,249 @@
+"""One time of a series, reconstructed by itself or from the time before, and its row."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ..bodies.rest_shape import moments
+from ..checks import InputError
+from ..inference import Compared, Decision, Score
+from ..io.atomic import atomic_path
+from ..io.guard import read_array
+from ..io.json import read_json, write_json
+from ..matter import MaterialPrior
+from ..methods import Method, Task
+from ..methods.continued import Continued
+from ..methods.illumination import prepared
+from ..methods.keeper import NAME, Keeper
+from ..methods.kinds import decide_kind
+from ..progress import FitProgress
+from ..representations import Stored, SurfaceMesh
+from ..scan import Scan
+from ..units import wavenumber
+from ..workflows.evaluate import Evaluation, evaluate, render
+from ..workflows.reconstruct import reconstruct
+from ..workflows.reconstruction import Reconstruction
+from ..workflows.run_folder import RunFolder, claimed
+from .folder import Begun, Body, Row
+from .plan import Settings
+
+PHASE = "phase.npy"
+"""The phase in the first view [rad], for pages."""
+BEGUN, REFERENCE = "begun.json", "reference.npy"
+"""How a time was begun, where that was decided; and what the last time that was begun by itself, or was compared with
+one that was, left of its frames: the powers of a `Score`."""
+WHAT = "what a time left of its frames"
+MOST_PIXELS = 160
+"""Pixels along the longer edge of that, at most: it is binned until it has no more."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """The frames of one time. scan: of that time alone; source: what source.json says of them; row: with the number and
+    the place of the time, which the result fills in."""
+
+    scan: Scan
+    prior: MaterialPrior
+    source: dict[str, object]
+    row: Row
+
+
+@dataclass(frozen=True)
+class Before:
+    """The time before: the folder of its run and its row."""
+
+    folder: RunFolder
+    row: Row
+
+
+def quiet(stage: str, fraction: float, record: dict[str, float]) -> None:
+    """Progress that nobody looks at."""
+
+
+def reconstruct_time(
+    shot: Shot, settings: Settings, folder: RunFolder, before: Before | None = None, on_progress: FitProgress = quiet
+) -> Row:
+    """Reconstruct one time into `folder`, and say what came of it; an unfinished run is continued.
+
+    A time that goes on from the one before is also begun by itself, if its last round still is of use, for then matter
+    has changed much, or if it explains its frames surely less well than the last time that began by itself explains its
+    own. The better one is kept (`_better`). Ctrl-C is passed on. Errors: `InputError` of `reconstruct`.
+    """
+    began, chosen = time.perf_counter(), folder.path / BEGUN
+    if before is None or not settings.warm.on or not _same_field(before, shot.scan):
+        done = _run(shot, settings, settings.method, folder, on_progress)
+        return _written(shot, settings, folder, done, replace(shot.row, begun="cold"), began)
+    warm = Continued.of(settings.method, before.folder.object.resolve(), settings.warm.effort)
+    said = read_json(chosen) if chosen.is_file() else {}
+    if said.get("begun") == "anew":  # it was cut off after that
+        done = _run(shot, settings, settings.method, folder, on_progress)
+        return _written(shot, settings, folder, done, replace(shot.row, **said), began)
+    _remove_other(folder, warm)
+    done = _run(shot, settings, warm, folder, on_progress, before)
+    row, reference = replace(shot.row, begun="warm"), before.folder.path / REFERENCE
+    left = _left(done, shot.scan)
+    if _settled(done) and _as_good(left, reference):
+        _keep(folder, read_array(reference, WHAT))
+        return _written(shot, settings, folder, done, row, began)
+    alone = RunFolder(folder.path.with_name(f"{folder.path.name}.cold"))
+    cold = _run(shot, settings, settings.method, alone, on_progress)
+    decision = _better(shot, settings, {"warm": done, "cold": cold})
+    said = {"begun": "warm" if decision.choice == "warm" else "anew", "decided": decision.line}
+    if decision.choice == "warm":
+        shutil.rmtree(alone.path)
+        _keep(folder, left.powers)
+    else:
+        write_json(alone.path / BEGUN, said)
+        shutil.rmtree(folder.path)
+        alone.path.rename(folder.path)
+        done = cold
+    return _written(shot, settings, folder, done, replace(shot.row, **said), began)
+
+
+def _left(done: Reconstruction, scan: Scan) -> Score:
+    """The score of a result on the training frames of `scan`."""
+    train = done.placed(scan).train()
+    return Score.of(train.left(torch.from_numpy(render(done, train.exposures))))
+
+
+def _keep(folder: RunFolder, powers: np.ndarray) -> None:
+    """Write the reference for the times that follow."""
+    with atomic_path(folder.path / REFERENCE) as temporary:
+        np.save(temporary, powers, allow_pickle=False)
+
+
+def _settled(done: Reconstruction) -> bool:
+    """Whether the last round of a fit from before was of no use."""
+    states = [each.compared for each in done.choice.decisions if each.name == NAME]
+    return bool(states) and not states[-1][-1].loses
+
+
+def _as_good(left: Score, reference: Path) -> bool:
+    """Whether a result does not leave surely more than the last one that began by itself."""
+    if not reference.is_file():
+        return False
+    other = Score(read_array(reference, WHAT), left.frames)
+    return other.powers.shape == left.powers.shape and not Compared("", *left.gain_over(other)).loses
+
+
+def _better(shot: Shot, settings: Settings, found: Mapping[Begun, Reconstruction]) -> Decision:
+    """The better one of two results, the null last: by the policy of a run's states (`Keeper`)."""
+    task = prepared(Task(shot.scan.train(), shot.prior, settings.seed, light=settings.light), settings.method)
+    keeper = Keeper(task.scan, mixed=True, unseen=partial(decide_kind, task, settings.method))
+    for name, done in found.items():
+        keeper.look(name, done.object, done.oversample)
+    return replace(keeper.decisions[0], name="begun")
+
+
+def _same_field(before: Before, scan: Scan) -> bool:
+    """Whether the time before was seen by the same pixels, at the same energy."""
+    summary, views = before.folder.read_summary(), scan.views
+    seen = summary["detector"]
+    alike = (seen["rows"], seen["columns"]) == views.shape
+    sizes = (seen["pixel_size_m"], views.finest), (summary["energy_kev"], scan.exposures.reference_energy)
+    return alike and all(abs(a / b - 1) < 1e-6 for a, b in sizes)
+
+
+def _remove_other(folder: RunFolder, method: Continued) -> None:
+    """Remove a run that was continued from another file, as before its folder was moved: it is done again with the same
+    numbers."""
+    if folder.config.is_file() and folder.read_config().get("method", {}).get("begin") != str(method.begin):
+        shutil.rmtree(folder.path)
+
+
+def _run(
+    shot: Shot,
+    settings: Settings,
+    method: Method,
+    folder: RunFolder,
+    on_progress: FitProgress,
+    before: Before | None = None,
+) -> Reconstruction:
+    matter = settings.matter
+    if before is not None:  # it was decided there
+        found = before.folder.read_summary().get("decided", {}).get("matter")
+        matter = "continuous" if found == "continuous" else "levels"
+    done = reconstruct(
+        shot.scan,
+        shot.prior,
+        method,
+        settings.seed,
+        matter=matter,
+        light=settings.light,
+        folder=folder,
+        resume=True,
+        on_progress=on_progress,
+    )
+    if not done.finished:
+        raise KeyboardInterrupt
+    return done
+
+
+def _share(done: Reconstruction) -> float:
+    """Share of the matter that the result leaves unexplained in its frames."""
+    return float(done.choice.judged.get(done.choice.kept, 0.0))
+
+
+def _written(shot: Shot, settings: Settings, folder: RunFolder, done: Reconstruction, row: Row, began: float) -> Row:
+    with claimed(folder):
+        folder.write_source(shot.source)
+        scan = done.placed(shot.scan)
+        evaluation = evaluate(done, scan, None)
+        write_phase(folder.path / PHASE, done.object, scan)
+        if not (folder.path / REFERENCE).is_file():
+            _keep(folder, _left(done, shot.scan).powers)
+        if settings.reports:
+            from ..report.run import report_run  # which needs matplotlib
+
+            report_run(folder, done, scan, evaluation, None)
+        for path in (folder.checkpoint, folder.earlier_checkpoint):  # of no use any more, and larger than the object
+            path.unlink(missing_ok=True)
+    return replace(filled(row, done, evaluation), seconds=round(time.perf_counter() - began, 3))
+
+
+def filled(row: Row, done: Reconstruction, evaluation: Evaluation) -> Row:
+    """`row` with what a finished reconstruction says."""
+    scores = {"test": evaluation.test, "train": evaluation.train}
+    means = {name: {} if one is None else one.as_dict()["mean"] for name, one in scores.items()}
+    total = done.total
+    told = {} if total is None else {"quantity": total.quantity, "total": total.value, "total_error": total.error}
+    verdict = done.verdict
+    said = {} if verdict is None else {"good": verdict.good, "words": verdict.words}
+    bodies = bodies_of(done.object)
+    found = {"kind": done.object.kind, "size": done.object.described, "unexplained": _share(done), "bodies": bodies}
+    return replace(row, status="done", **found, **means, **told, **said)
+
+
+def bodies_of(found: Stored) -> tuple[Body, ...]:
+    """Centre x, y, z [m] and volume [m³] of each closed body, the largest first; none of an object without."""
+    if not isinstance(found, SurfaceMesh):
+        return ()
+    try:
+        meshes = found.bodies()
+    except InputError:  # no surface encloses matter
+        return ()
+    parts = [moments(mesh)[:2] for mesh in meshes]
+    return tuple((*(float(x) for x in centre), float(volume)) for volume, centre in parts)  # type: ignore[misc]
+
+
+def write_phase(path: Path, found: Stored, scan: Scan) -> None:
+    """Write the phase -k ∫δ [H, W] [rad] in the first view, float16, binned to `MOST_PIXELS`."""
+    views = scan.views[[0]]
+    with torch.no_grad():
+        _, lines = found.project(views)
+        delta = lines[0].cpu().numpy()
+    factor = -(-max(views.shape) // MOST_PIXELS)
+    h, w = (n // factor * factor for n in views.shape)
+    binned = delta[:h, :w].reshape(h // factor, factor, w // factor, factor).mean((1, 3))
+    with atomic_path(path) as temporary:
+        np.save(
+            temporary, (-wavenumber(scan.exposures.reference_energy) * binned).astype(np.float16), allow_pickle=False
+        )

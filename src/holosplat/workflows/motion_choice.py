@@ -1,0 +1,100 @@
+"""How matter changes over the times of a scan, chosen by frames that were set aside."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import cache
+from typing import Literal
+
+import numpy as np
+import torch
+
+from ..checks import InputError, require
+from ..inference import Decision, Score, select
+from ..matter import MaterialPrior, MatterKind
+from ..methods import Auto, Method
+from ..methods.cross_validation import predicted_frames
+from ..motion.timed_frames import merged
+from ..optics.background import LightOptions
+from ..scan import Scan
+from ..volume import Object
+from .reconstruct import reconstruct
+from .track import reconstruct_moving, track
+
+Motion = Literal["each", "still", "flow", "bodies"]
+MOTION, BY = "motion", "times set aside"
+LOOKED_AT, FEWEST = 3, 6
+"""Times that are set aside, at most; and times from which on some can be, for a flow needs three others."""
+
+Way = Callable[[Scan], Object | None]
+"""Matter at all times from the frames of some; None where there is none of this kind."""
+
+
+def choose_motion(
+    scan: Scan,
+    prior: MaterialPrior,
+    method: Method = Auto(),
+    seed: int = 0,
+    *,
+    light: LightOptions | None = None,
+    matter: MatterKind | None = None,
+) -> Decision:
+    """Whether each time is best taken by itself, or all as still matter, as matter that a flow carries, or as bodies.
+
+    Some times are set aside. Still matter, flow and bodies are found in the frames of the others; the null, a time by
+    itself, in its own frames but one, which all of them predict. So what is taken in place of the null predicts times
+    that it has not seen better than they themselves do. Errors: `InputError` for few times, and for times of one frame.
+    """
+
+    def alone(part: Scan) -> Object:
+        return reconstruct(part, prior, method, seed, light=light, matter=matter).object
+
+    def carried(part: Scan) -> Object | None:
+        found = reconstruct_moving(part, prior, seed=seed, light=light)
+        return None if found is None else found.reconstruction.object
+
+    ways: Mapping[str, Way] = {
+        "still": lambda part: alone(merged(part)),
+        "flow": carried,
+        "bodies": lambda part: track(part, prior, seed=seed, light=light).object,
+    }
+    return decide(scan.train(), alone, ways)
+
+
+def decide(train: Scan, alone: Way, ways: Mapping[str, Way]) -> Decision:
+    """The decision between times `alone`, the null, and `ways` of all times, each from simple to complex."""
+    times = train.instants
+    require(
+        len(times) >= FEWEST,
+        f"--motion auto sets times aside, so it needs {FEWEST} of them or more, but the scan has {len(times)}; "
+        "name the motion.",
+    )
+    aside = np.unique(np.linspace(1, len(times) - 2, LOOKED_AT).round().astype(int))
+    of_time = [np.flatnonzero(train.exposures.time == times[k]) for k in aside]
+    few = min(map(len, of_time))
+    require(few > 1, "--motion auto sets a frame of a time aside, but a time has one training frame; name the motion.")
+    unseen = [frames[n % len(frames)] for n, frames in enumerate(of_time)]
+    others = train[np.flatnonzero(~np.isin(train.exposures.time, times[aside]))]
+
+    @cache
+    def found(name: str) -> Object | None:
+        try:
+            return ways[name](others)
+        except InputError:  # there is no matter of this kind
+            return None
+
+    @cache
+    def single(n: int) -> Object | None:
+        return alone(train[np.setdiff1d(of_time[n], unseen[n : n + 1])].as_static())
+
+    def score(name: str, fold: int) -> Score:
+        left = []
+        for n, frame in enumerate(unseen):
+            part = train[[frame]].as_static()
+            matter = single(n) if name == "each" else found(name)
+            now = None if matter is None else matter.at(float(times[aside[n]]))
+            predicted = torch.ones(part.frames.shape) if now is None else predicted_frames(part.exposures, now)
+            left.append(part.left(predicted))
+        return Score.of(torch.cat(left))
+
+    return select(MOTION, ("each", *ways), score, by=BY)
