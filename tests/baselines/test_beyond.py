@@ -16,7 +16,6 @@ from holosplat.fit.smooth_volume import ContinuousPrior, VolumeProblem
 from holosplat.fit.whitened import WhitenedFrames
 from holosplat.geometry import Grid, Views
 from holosplat.matter import MaterialPrior, Matter
-from holosplat.methods.mass import total_delta
 from holosplat.methods.method import Task
 from holosplat.methods.surface_fit import field_of
 from holosplat.methods.volume import SmoothStage, SmoothVolume
@@ -26,6 +25,7 @@ from holosplat.optics.retrieval.bounded import NOWHERE
 from holosplat.representations import GaussianCloud, VoxelGrid
 from holosplat.representations.initialise import cloud_from_volume
 from holosplat.scan import Scan
+from holosplat.workflows.totals import total_delta
 
 TOP, ROWS, BEYOND = 7, 11, 4
 RATIO = MATERIAL.beta / MATERIAL.delta

@@ -16,9 +16,9 @@ from holosplat.fit.schedule import Schedule
 from holosplat.geometry import Grid
 from holosplat.methods import Gaussians, SurfaceOptions, Task
 from holosplat.methods.coarse import CoarseToFine
+from holosplat.methods.first_surfaces import cut_as_seen, in_turns
 from holosplat.methods.method import quiet
 from holosplat.methods.surface_fit import SurfaceFit, cut_surfaces
-from holosplat.methods.turns import cut_as_seen, in_turns
 
 OPTIONS = Gaussians(coarse=CoarseToFine(coarse_steps=20, views=1))
 HOW = SurfaceOptions(fit=SurfaceFit(schedule=Schedule(steps=20)))
@@ -99,9 +99,9 @@ def turned(left: list[float], noisy: Task, monkeypatch: pytest.MonkeyPatch, turn
         judged.append(count[id(found)])
         return left[judged[-1]]
 
-    monkeypatch.setattr("holosplat.methods.turns.settled", lambda task, start, surfaces, how: start)
-    monkeypatch.setattr("holosplat.methods.turns._cut_again", cut_again)
-    monkeypatch.setattr("holosplat.methods.turns._left", leaves)
+    monkeypatch.setattr("holosplat.methods.first_surfaces.settled", lambda task, start, surfaces, how: start)
+    monkeypatch.setattr("holosplat.methods.first_surfaces._cut_again", cut_again)
+    monkeypatch.setattr("holosplat.methods.first_surfaces._left", leaves)
     options = replace(OPTIONS, coarse=replace(OPTIONS.coarse, turns=turns, turn_gain=0.01))
     return count[id(in_turns(noisy, meshes[0], options, HOW))], len(judged)
 
@@ -126,7 +126,7 @@ def test_a_volume_without_a_surface_ends_them(noisy, monkeypatch):
     def none(*given) -> object:
         raise InputError("no surface")
 
-    monkeypatch.setattr("holosplat.methods.turns.settled", lambda task, start, surfaces, how: start)
-    monkeypatch.setattr("holosplat.methods.turns._cut_again", none)
+    monkeypatch.setattr("holosplat.methods.first_surfaces.settled", lambda task, start, surfaces, how: start)
+    monkeypatch.setattr("holosplat.methods.first_surfaces._cut_again", none)
     start = mesh_of(2)
     assert in_turns(noisy, start, OPTIONS, HOW) is start

@@ -11,8 +11,8 @@ from holosplat.baselines import HolographicTV
 from holosplat.fit.schedule import Schedule
 from holosplat.methods import Gaussians, SurfaceOptions
 from holosplat.methods.coarse import CoarseToFine, missing_matter
+from holosplat.methods.first_surfaces import in_turns
 from holosplat.methods.surface_fit import SurfaceFit
-from holosplat.methods.turns import in_turns
 from holosplat.representations import SurfaceMesh
 
 triton = pytest.importorskip("triton")

@@ -20,7 +20,7 @@ from holosplat.methods.contrast import ABOVE, BOTH, STAGE, decide_sides
 from holosplat.methods.illumination import decided, prepared
 from holosplat.methods.method import first_of_task
 from holosplat.methods.start import starting_cloud
-from holosplat.methods.trials import Trials
+from holosplat.methods.trials import WITHOUT, Trials
 from holosplat.optics.background import LightOptions
 from holosplat.optics.retrieval import RETRIEVALS, tikhonov
 from holosplat.scan import Exposures, Scan
@@ -216,14 +216,23 @@ def test_the_command_line_tells_the_side():
         replace(told, contrast="above").prior(20.0)
 
 
-@pytest.mark.parametrize(("taken", "chosen"), [((), ABOVE), (("uneven light",), BOTH)])
-def test_frames_are_left_alone_where_both_sides_explain_them_as_well(bodies, monkeypatch, taken, chosen):
-    """Where light was taken beside matter of one side, the null is matter of both in even light."""
-    tie = Score.of(torch.randn(2, 5, 7, generator=torch.Generator().manual_seed(1), dtype=torch.float64))
-    monkeypatch.setattr(Trials, "score", lambda *of: tie)
-    first = replace(first_of_task(Task(bodies, MaterialPrior.of_ratio(1500).signed(1))), taken=taken)
-    assert decide_sides(first, LightOptions())[1].choice == chosen
-    assert decide_sides(first, LightOptions(), taken)[1].choice == ABOVE  # its user says what the light is
+@pytest.mark.parametrize(
+    ("even", "both", "lit", "chosen"),
+    [(2.0, 1.0, 1.0, BOTH), (1.0, 1.0, 1.0, ABOVE), (2.0, 1.0, 0.5, ABOVE), (1.0, 2.0, 2.0, ABOVE)],
+)
+def test_frames_are_left_alone_where_both_sides_explain_them_as_well(bodies, monkeypatch, even, both, lit, chosen):
+    """Light that was taken beside matter of one side stays where it predicts more than matter of both does."""
+
+    def score(trials: Trials, name: str, fold: int) -> Score:
+        power = both if trials._first.prior.two_sided else lit if name == "uneven light" else even
+        return Score(np.full((8, 3), 9.0 if WITHOUT in name else power), 2)
+
+    monkeypatch.setattr(Trials, "score", score)
+    first = replace(first_of_task(Task(bodies, MaterialPrior.of_ratio(1500).signed(1))), taken=("uneven light",))
+    found, decision = decide_sides(first, LightOptions())
+    assert decision.choice == chosen
+    assert found.prior.two_sided == (chosen == BOTH)
+    assert decide_sides(first, LightOptions(), first.taken)[1].choice == ABOVE  # its user says what the light is
 
 
 def test_light_that_is_uneven_stays_beside_bodies(bodies):

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from holosplat.methods.trials import binned_options, finer_light
 from holosplat.optics.background import Light, LightOptions
-from holosplat.optics.finer_light import binned_options, finer_light
 
 
 def lit(shape: tuple[int, int]) -> tuple[torch.Tensor, torch.Tensor]:

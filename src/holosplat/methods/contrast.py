@@ -62,26 +62,31 @@ def decide_sign(first: FirstVolumes, *scores: Scoring) -> tuple[FirstVolumes, tu
 def decide_sides(first: FirstVolumes, light: LightOptions, told: Hypothesis = ()) -> tuple[FirstVolumes, Decision]:
     """The first volumes of matter on one side of its medium, or on both, and the decision between them.
 
-    Light makes up for matter that may not be there. So volumes of both sides, in the light that is `told` alone, are
-    compared with those of one in the light that was taken beside them. The null leaves the frames alone: where light
-    was taken, it is both sides, else one.
+    Light makes up for matter that may not be there, and both sides for light. So both sides must predict unseen frames
+    better than one, under the light that is `told` alone, and no worse than one in the light that was taken beside it:
+    where these are alike, the frames are left alone.
     """
     first.on_progress(STAGE, 0.0)
     one = ABOVE if first.prior.delta_sign > 0 else BELOW
     two = both_sides(first)
-    trials = {one: (Trials(first, light), name_of(first.taken)), BOTH: (Trials(two, light), name_of(told))}
+    lit, single = f"{one} in {name_of(first.taken)}", Trials(first, light)
+    trials = {one: (single, told), BOTH: (Trials(two, light), told)}
+    if first.taken != told:
+        trials[lit] = single, first.taken
 
     def scored(name: str, fold: int) -> Score:
         side, without, _ = name.partition(WITHOUT)
         tried, taken = trials[side]
         try:
-            return tried.score(taken + without, fold)
+            return tried.score(name_of(taken) + without, fold)
         except InputError:  # there is no such matter
             return _without_matter(first, fold)
 
-    candidates, by = ((one, BOTH) if first.taken == told else (BOTH, one)), first.folds.by
-    decision = select(STAGE, candidates, scored, first.folds.count, by=by, beside={BOTH: (BOTH + WITHOUT,)})
-    return (two if decision.choice == BOTH else first), decision
+    beside, by = {BOTH: (BOTH + WITHOUT,)}, first.folds.by
+    decision = select(STAGE, tuple(trials), scored, first.folds.count, by=by, beside=beside)
+    if decision.choice == BOTH:
+        return two, decision
+    return first, replace(decision, choice=one)
 
 
 def both_sides(first: FirstVolumes) -> FirstVolumes:

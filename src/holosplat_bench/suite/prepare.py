@@ -17,7 +17,7 @@ from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.io.volumes import read_volume, write_volume
 from holosplat.scan import Scan
 from holosplat.specimens.continuous import ContinuousScene
-from holosplat.specimens.drawn import Scene
+from holosplat.specimens.drawn import ChangingScene, Scene, Still
 from holosplat.specimens.rods import RodScene
 from holosplat.volume import Volume
 from holosplat.workflows.provenance import scan_hash
@@ -60,7 +60,7 @@ def fingerprint(case: Case) -> str:
         digest.update(np.ascontiguousarray(array).tobytes())
     energy = exposures.one_energy("a case of the benchmark")
     numbers = (views.shape, views.pixel_size, energy, case.photons, case.prior.as_dict(), case.seed)
-    digest.update(repr((numbers, _matter(case.scene))).encode())
+    digest.update(repr((numbers, [each for still in _stills(case.scene) for each in _matter(still)])).encode())
     if not case.light.is_even:
         digest.update(repr(case.light).encode())
     if case.misalignment:
@@ -68,7 +68,12 @@ def fingerprint(case: Case) -> str:
     return digest.hexdigest()[:16]
 
 
-def _matter(scene: Scene) -> list[object]:
+def _stills(scene: Scene) -> list[Still]:
+    """A scene, or one that changes at its first, middle and last time."""
+    return [scene.drawn(share) for share in (0.0, 0.5, 1.0)] if isinstance(scene, ChangingScene) else [scene]
+
+
+def _matter(scene: Still) -> list[object]:
     """δ and β of each body, and the profiles of continuous ones."""
     if isinstance(scene, ContinuousScene):
         return [(element.profile, tuple(element.matter)) for element in scene.elements]
@@ -78,14 +83,15 @@ def _matter(scene: Scene) -> list[object]:
 
 
 def _arrays(case: Case) -> Iterable[np.ndarray]:
-    if isinstance(case.scene, ContinuousScene):
-        for element in case.scene.elements:
-            yield from (element.centre, element.axes, element.gradient)
-    elif isinstance(case.scene, RodScene):
-        yield from (case.scene.ends, case.scene.radii)
-    else:
-        for mesh in case.scene.meshes:
-            yield from (mesh.vertices, mesh.faces)
+    for scene in _stills(case.scene):
+        if isinstance(scene, ContinuousScene):
+            for element in scene.elements:
+                yield from (element.centre, element.axes, element.gradient)
+        elif isinstance(scene, RodScene):
+            yield from (scene.ends, scene.radii)
+        else:
+            for mesh in scene.meshes:
+                yield from (mesh.vertices, mesh.faces)
     exposures = case.exposures
     yield from (exposures.views.rotations, exposures.views.shifts)
     yield from (exposures.distance, exposures.psf_sigma_px, exposures.time, np.asarray(case.is_test, dtype=bool))
