@@ -162,16 +162,15 @@ class Beside:
         self._log = self._log + np.log(np.maximum(small, np.finfo(float).tiny))
 
     def tell(self) -> None:
-        """Warns of frames without matter where the others have some, and of flats that lie otherwise. Errors:
-        `InputError` for frames without light."""
+        """Warns of frames without light, of those without matter where the others have some, and of flats that lie
+        otherwise. Matter that is thick along a beam hides its light as a shutter does, so that no frame is refused."""
         dark, empty = dark_or_empty(*np.array([*self._seen.values()]).T)
         names = [f"frame {n}" for n in self._seen]
-        require(
-            not dark.any(),
-            f"{self.label}: projections must have light, but beside the others there is none in "
-            f"{_listed(names, dark)}, as in darks or with a closed shutter; leave such frames out by --leave-out or "
-            "--views.",
-        )
+        if dark.any():
+            warn(
+                f"{self.label}: beside the other projections there is no light in {_listed(names, dark)}; if they are "
+                "darks, or the shutter was closed, leave such frames out by --leave-out or --views"
+            )
         if self.still and empty.any():
             warn(
                 f"{self.label}: there is matter in the other projections, but none in {_listed(names, empty)}; if the "
