@@ -17,6 +17,7 @@ from holosplat.fit.whitened import WhitenedFrames
 from holosplat.geometry import Grid, Views
 from holosplat.matter import MaterialPrior, Matter
 from holosplat.methods.method import Task
+from holosplat.methods.modulation import total_delta
 from holosplat.methods.surface_fit import field_of
 from holosplat.methods.volume import SmoothStage, SmoothVolume
 from holosplat.optics.noise_model import NoiseModel
@@ -25,7 +26,6 @@ from holosplat.optics.retrieval.bounded import NOWHERE
 from holosplat.representations import GaussianCloud, VoxelGrid
 from holosplat.representations.initialise import cloud_from_volume
 from holosplat.scan import Scan
-from holosplat.workflows.totals import total_delta
 
 TOP, ROWS, BEYOND = 7, 11, 4
 RATIO = MATERIAL.beta / MATERIAL.delta

@@ -14,13 +14,13 @@ from holosplat.fit.whitened import WhitenedFrames
 from holosplat.geometry import Grid
 from holosplat.matter import MaterialPrior, Matter
 from holosplat.methods.method import Task
+from holosplat.methods.modulation import total_delta
 from holosplat.methods.volume import SmoothStage, SmoothVolume
 from holosplat.methods.voxels import VoxelFit, VoxelStage
 from holosplat.optics.noise_model import NoiseModel
 from holosplat.optics.retrieval import bounded_estimate
 from holosplat.representations import VoxelGrid
 from holosplat.scan import Scan
-from holosplat.workflows.totals import total_delta
 
 LEFT = 8
 COLUMNS = SHAPE[1] - 2 * LEFT

@@ -131,7 +131,7 @@ FAST = {"reconstruct": "--preset fast"}
 BOTH_SIDES = """$(case "$*" in *both*|*nylon*) echo --method volume ;; *) echo --preset fast ;; esac)"""
 """Gaussians lie on one side of their medium, and so few pixels of fibres show none."""
 LAST = "--truth truth_t0002.h5"
-OF_CELLS = "--frames 3 --frame-rate 1e5 --pulses 1 --truth-frames 0 2"
+OF_CELLS = "--frames 3 --frame-rate 1e5 --pulses 2 --truth-frames 0 2"
 SNAPSHOTS = f"""$(case "$*" in *espresso*) echo {OF_CELLS} ;; *) echo --views 4 ;; esac)"""
 PAGES: dict[str, Small] = {
     "README.md": Small(f"{SCAN} my_scan.h5", FAST),

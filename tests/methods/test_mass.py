@@ -12,11 +12,11 @@ from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta, Matter
+from holosplat.methods.modulation import MODEL_SHARE, RATIO_SHARE, total_delta
 from holosplat.optics.noise_model import NoiseModel
 from holosplat.representations import VoxelGrid
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.soft_matter import soft_cells
-from holosplat.workflows.totals import MODEL_SHARE, RATIO_SHARE, total_delta
 
 PIXEL, SHAPE, VIEWS = 1e-6, (41, 45), 8
 MATERIAL = DeltaBeta(6e-7, 4e-10)

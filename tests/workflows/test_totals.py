@@ -27,13 +27,14 @@ from holosplat.methods import (
     VoxelFit,
     Voxels,
 )
+from holosplat.methods.modulation import Total
 from holosplat.methods.uncertain import Determined
 from holosplat.report.content import ReportContent
 from holosplat.report.page import score_tables
 from holosplat.representations import VoxelGrid
 from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
 from holosplat.workflows.run_folder import RunFolder
-from holosplat.workflows.totals import MOST_VIEWS, Total, TotalMatter, in_words, total_of_run
+from holosplat.workflows.totals import MOST_VIEWS, TotalMatter, in_words, total_of_run
 
 VOLUME = HolographicTV(iterations=40, corrections=3, inner=10, refine=1)
 METHODS = {
