@@ -7,7 +7,6 @@ from .benchmark import Row, markdown, read, table
 KINDS = ["bubbles", "cuvette", "jet", "break-up", "crack", "shock", "keyhole", "lattice", "fibres", "channel", "star"]
 HEAD = {
     ("large", "told"): "12 views, no noise: told",
-    ("large", "nothing told"): "nothing told",
     ("small", "told"): "8 noisy views: told",
     ("small", "nothing told"): "nothing told",
     ("small", "Paganin, TV"): "Paganin and total variation",
