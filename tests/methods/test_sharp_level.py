@@ -13,10 +13,12 @@ from holosplat.baselines.material import estimate_delta, level_of
 from holosplat.baselines.tomography import plateau
 from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
-from holosplat.geometry import Views
-from holosplat.matter import DeltaBeta, MaterialPrior
+from holosplat.geometry import Grid, Views
+from holosplat.matter import DeltaBeta, MaterialPrior, Matter
 from holosplat.methods import SmoothVolume, Task, sharp_level
+from holosplat.methods.method import first_of_task
 from holosplat.methods.sharp_level import material_of_levels
+from holosplat.representations import VoxelGrid
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens import MeshScene
 from holosplat.specimens.phantoms import place_capsules
@@ -83,3 +85,19 @@ def test_a_level_takes_as_many_views_as_take_no_longer(noisy):
         task = sharp_level.in_few_views(Task(scan, MaterialPrior.of_ratio(1.0)))
         assert len(task.scan) == wanted
         assert task.scan.views.rotations[[0, -1]].tolist() == scan.views.rotations[[0, -1]].tolist()
+
+
+def test_a_run_finds_its_level_once_and_takes_that_of_a_volume_that_is_there(noisy):
+    said = list[str]()
+    prior = MaterialPrior.of_ratio(WATER.ratio)
+    plain = Task(noisy, prior, on_progress=lambda stage, part: said.append(stage))
+    task = replace(plain, first=first_of_task(plain))
+    found = material_of_levels(task)
+    assert "level of the matter" in said
+    said.clear()
+    assert material_of_levels(task) == found
+    assert said == []
+    grid = Grid.of_views(noisy.views)
+    known = VoxelGrid(torch.full((1, *grid.shape), 3.0), grid, Matter.one(*WATER))
+    assert material_of_levels(replace(plain, likeliest=known)).delta == pytest.approx(3 * WATER.delta)
+    assert "level of the matter" not in said
