@@ -214,6 +214,26 @@ def test_a_fit_that_finds_no_matter_predicts_frames_without_any(soft, monkeypatc
     np.testing.assert_allclose(found.powers, empty.powers)
 
 
+def test_the_level_of_a_fit_is_that_of_the_continuous_fit_beside_it(soft, monkeypatch):
+    """Of two levels, and of a known material, none is looked for."""
+    place, seen = import_module("holosplat.methods.levels"), dict[str, object]()
+    grid = Grid.of_views(soft.views)
+    smooth = VoxelGrid(torch.ones((1, *grid.shape)), grid, Matter.one(*MATERIAL))
+
+    def fitted(method, task) -> VoxelGrid:
+        seen[task.matter] = task.likeliest
+        return smooth
+
+    monkeypatch.setattr(place, "solve_stages", fitted)
+    kinds = {"levels": Auto().gaussians, "continuous": Auto().volume}
+    task = Task(soft, RATIO, lit=plain_light(torch.from_numpy(soft.frames), LightOptions()))
+    TrialFits(task, first_of_task(task), kinds).score("as measured", "levels", 0)
+    assert seen == {"continuous": None, "levels": smooth}
+    known = replace(task, prior=KNOWN)
+    TrialFits(known, first_of_task(known), kinds).score("as measured", "levels", 0)
+    assert seen["levels"] is None
+
+
 def test_too_few_views_are_said(sharp):
     assert "too few views" in decide_matter(Task(sharp[[0, 4]], RATIO)).by
 
