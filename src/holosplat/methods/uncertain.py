@@ -120,11 +120,14 @@ def determine(task: Task, uncertain: Uncertain, options: ProfileOptions | None =
         return _untold(ranges, middle, "the frames show absorption alone")
     corners = [dict(zip(ranges, ends)) for ends in zip(*map(_sorted, ranges.values()))]
     corners += [corner | {"distance": longest} for corner in corners if longest]
-    ratio = _assumed_ratio(task, middle)
+    ratio, start = _assumed_ratio(task, middle), {}
+    if uncertain.delta_beta:
+        low, high = _sorted(uncertain.delta_beta)
+        start["delta_beta"] = ratio = min(max(ratio, low), high)
     profile = Profile(task, ratio, middle | {"delta_beta": ratio}, corners, options or ProfileOptions())
     if profile.air() < ENOUGH_AIR:
         return _untold(ranges, middle, "too few pixels show empty space, without which frames cannot tell")
-    return Search(profile, ranges, task).run()
+    return Search(profile, ranges, task, start).run()
 
 
 def likeliest_ratio(task: Task, options: ProfileOptions | None = None) -> Determined:
@@ -185,8 +188,6 @@ def _require_one(task: Task, uncertain: Uncertain) -> None:
 
 def _assumed_ratio(task: Task, middle: Mapping[str, float]) -> float:
     """δ/β for the first volume, at the nominal energy of the task."""
-    if "delta_beta" in middle:
-        return middle["delta_beta"]
     if task.prior.materials:
         known = task.prior.materials[0]
         return known.ratio if math.isfinite(known.ratio) else 10 ** MaterialEstimate().highest * 10
@@ -205,11 +206,13 @@ def _sorted(ends: Range) -> Range:
 
 @dataclass
 class Search:
-    """The likeliest constants: on a grid along each, and then by Newton's method; logarithms of sizes throughout."""
+    """The likeliest constants: by steps along each from `begun`, or from the middle of its range, and then by Newton's
+    method; logarithms of sizes throughout."""
 
     profile: Profile
     ranges: Mapping[str, Range]
     task: Task
+    begun: Mapping[str, float] = field(default_factory=dict)
     _values: dict[tuple[float, ...], float] = field(default_factory=dict)
     _planned: int = 1
 
@@ -219,6 +222,9 @@ class Search:
         self.low, self.high = ends.min(axis=1), ends.max(axis=1)
         self.middle, self.half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
         self.sign = np.sign([r[0] for r in self.ranges.values()])
+        self.start = self.middle.copy()
+        for name, value in self.begun.items():
+            self.start[self.names.index(name)] = math.log(abs(value))
         k = len(self.names)
         self.places = [MANY if h > 0.5 * math.log(WIDE) else FEW for h in self.half]
         self._planned = sum(self.places) + (NEWTON + 1) * (2 * k + k * (k - 1) // 2)
@@ -231,17 +237,25 @@ class Search:
 
     def _likeliest(self) -> tuple[np.ndarray, np.ndarray]:
         """Where the posterior is largest, and the last steps of differences."""
-        at = self.middle.copy()
-        for i, places in enumerate(self.places):
-            tried = np.linspace(self.low[i], self.high[i], places)
-            at[i] = tried[int(np.argmin([self._likely(_with(at, i, value)) for value in tried]))]
-        step = np.array([2 * h / (places - 1) for h, places in zip(self.half, self.places)])
+        at, step = self.start.copy(), np.array([2 * h / (places - 1) for h, places in zip(self.half, self.places)])
+        for i in range(len(at)):
+            at = self._descended(at, i, step[i])
         for _ in range(NEWTON):
             _, hessian = self._slopes(at, step)
             shown = 0.5 * np.diag(hessian) * step**2 > SEEN * self._temperature()
             step = np.where(shown, step / 2, step)
             at = self._moved(at, step)
         return at, step
+
+    def _descended(self, at: np.ndarray, i: int, step: float) -> np.ndarray:
+        """From `at`, or an end of the range of constant `i`, by steps [logarithm] to where neither side is likelier."""
+        at = min([at, _with(at, i, self.low[i]), _with(at, i, self.high[i])], key=self._cost)
+        while True:
+            sides = (float(np.clip(at[i] + s * step, self.low[i], self.high[i])) for s in (-1, 1))
+            best = min([at, *(_with(at, i, side) for side in sides)], key=self._cost)
+            if best is at:
+                return at
+            at = best
 
     def _constants(self, at: np.ndarray) -> dict[str, float]:
         return {name: float(value) for name, value in zip(self.names, self.sign * np.exp(at))}
