@@ -171,7 +171,7 @@ def simulate(
     require(beamline.exposures is None or not source.cone, "--cone goes with --distance; leave it, or --exposures.")
     of_source, beamline = source.facts(beamline), source.applied(beamline)
     named = imaged.generated.in_medium(filling)
-    views, filled = beamline.planned(), named.filling()
+    views, filled = beamline.planned(), named.filling(beamline.medium_index)
     true_views = experiment.misalignment.errors().true_exposures(views)
     with ProgressBar() as bar:
         times = imaged.generated.timing(motion) if imaged.generated.specimen else np.zeros(1)

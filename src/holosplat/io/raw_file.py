@@ -14,7 +14,8 @@ from ..checks import UnsaidError, in_range, require
 from ..divided_light import DividedLight
 from ..geometry import Views, rotation_y
 from ..preprocess.flat_field import mean_frame
-from ..scan import DISTANCE_RANGE_M, ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, checked_distance
+from ..scan import DISTANCE_RANGE_M, PIXEL_RANGE_M, Exposures, checked_distance
+from ..units import BEAM_RANGE_KEV
 from .stacks import ImageStack
 
 if TYPE_CHECKING:
@@ -28,7 +29,7 @@ RAW_TAKES = (*TAKES, "leave_out")
 """The same for files whose flats and darks are read frame by frame."""
 NOTHING: Mapping[str, Any] = {}
 RANGES = {
-    "energy_kev": (ENERGY_RANGE_KEV, "keV"),
+    "energy_kev": (BEAM_RANGE_KEV, "keV"),
     "distance": (DISTANCE_RANGE_M, "metres"),
     "pixel_size": (PIXEL_RANGE_M, "metres"),
 }

@@ -17,7 +17,7 @@ import numpy as np
 from ..checks import InputError, UnsaidError, finite, in_range, require, shaped, warn
 from ..geometry import Views, rotation_y
 from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, checked_distance
-from ..units import ANGLE_UNITS, ENERGY_UNITS, LENGTH_UNITS, PLANCK_TIMES_C_KEV_M, TIME_UNITS
+from ..units import ANGLE_UNITS, BEAM_RANGE_KEV, ENERGY_UNITS, LENGTH_UNITS, PLANCK_TIMES_C_KEV_M, TIME_UNITS
 from .hdf5 import Fields, attribute_text, open_hdf5
 from .light import read_divided_light
 from .nxtomo_geometry import FLIPS as FLIPS
@@ -292,7 +292,9 @@ def _energies(fields: Fields, kinds: np.ndarray, given: Mapping[str, Any]) -> np
     else:
         energies = _per_frame(fields, kinds, name) * fields.unit(name, ENERGY_UNITS, "keV")
     for energy in (energies.min(), energies.max()):
-        in_range(fields.label(name), float(energy), *ENERGY_RANGE_KEV, unit="keV")
+        in_range(
+            fields.label(name), float(energy), *(BEAM_RANGE_KEV if name in WAVELENGTHS else ENERGY_RANGE_KEV), "keV"
+        )
     same = np.allclose(energies, energies[0], rtol=1e-6, atol=0)
     return np.full(len(energies), energies[0]) if same else energies
 
