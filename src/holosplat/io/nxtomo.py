@@ -166,7 +166,7 @@ def _write_instrument(instrument: h5py.Group, exposures: Exposures, raw: RawLayo
     energy = float(exposures.energy_kev[0]) if exposures.has_one_energy else exposures.energy_kev
     beam = _group(instrument, "beam", "NXbeam")
     if exposures.energy_kev.min() < ENERGY_RANGE_KEV[0]:  # light; of electrons a wavelength is told as an energy
-        _put(beam, "incident_wavelength", wavelength(energy), "m")
+        _put(beam, "incident_wavelength", wavelength(np.asarray(energy)), "m")
     else:
         source["probe"] = "x-ray"
         _put(beam, "incident_energy", energy, "keV")

@@ -121,7 +121,7 @@ def through_detector(model: WaveModel, phase: Tensor) -> Tensor:
     `φ + (dφ + r dℓ) / (1 + r²)`, `r = β/δ`.
     """
     path, r, sign = model.path, model.ratio, model.sign
-    transfer = path.rows[:, :, None] * path.columns[:, None]
+    transfer = path.transfer
     before = exit_wave_of(sign * r * phase, sign * phase)
     detector = 1 + torch.fft.ifft2(torch.fft.fft2(before) * transfer)
     gain = _gain(model, phase)

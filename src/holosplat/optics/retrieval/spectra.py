@@ -21,6 +21,7 @@ from ...scan import Exposures
 from ...units import wavelength, wavenumber
 from ..noise import noise_levels, with_gaps
 from ..noise_model import NoiseModel
+from ..propagation import transfer_phase
 from ..sampling import smooth_margin
 
 TINY = 1e-24
@@ -105,9 +106,9 @@ def squared_frequency(raster: Raster) -> Tensor:
 
 
 def fresnel_phase(exposures: Exposures, raster: Raster) -> Tensor:
-    """`χ = πλz f²` [V, H, W//2 + 1] of each exposure's distance."""
-    lam_z = torch.from_numpy(wavelength(exposures.energy_kev) * exposures.distance)
-    return math.pi * lam_z[:, None, None] * squared_frequency(raster)
+    """`χ = πλz f²` [V, H, W//2 + 1] of each exposure's distance, or that of the angular spectrum."""
+    f2, optics = squared_frequency(raster), (exposures.distance, exposures.energy_kev)
+    return transfer_phase(f2, raster.shape, raster.pitch, *optics)
 
 
 def detector_transfer(exposures: Exposures, raster: Raster) -> Tensor:
