@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from ..checks import InputError, require
-from ..ranges import Frequency, Index, Natural, Signed, Small, ranged
+from ..ranges import Frequency, Index, Natural, Positive, Signed, Small, ranged
 from ..tables import LARGEST, from_table, number_in, shown, to_table
 from ..units import photon_energy
 from .angles import read_angles, tell_angles, tell_views
@@ -42,6 +42,8 @@ class Told:
     """Effective propagation distance [m], or a range LOW:HIGH for `reconstruct` (default: as the files say)."""
     pixel_size: Small | None = None
     """Effective pixel size [m] (default: as the files say)."""
+    source_distance: Positive | None = None
+    """Distance from a point source to the sample [m]; distance and pixel are then those of the detector itself."""
     angles: Path | None = None
     """Text file of the frames' angles [degrees], one a line, or in a column that its first line names (default: as the
     files say)."""
