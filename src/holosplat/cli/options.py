@@ -127,6 +127,8 @@ class BeamlineOptions(Directions):
     """With it: refractive index of the medium in which light travels and matter lies (default: 1)."""
     distance: Metres = 0.1
     """Effective propagation distance [m]."""
+    distances: tuple[Metres, ...] = ()
+    """Or several: all views are taken at each of them [m], and frames of a pose are used together."""
     pixel_size: Small = 3.2e-6
     """Effective pixel size [m]."""
     psf_sigma_px: Pixels = 0.0
@@ -139,6 +141,8 @@ class BeamlineOptions(Directions):
     def told(self) -> BeamlineOptions:
         """The same with one photon energy, and what the file of --exposures says; `InputError` for options that say it
         twice."""
+        once = not self.distances or (self.distance == BeamlineOptions.distance and self.exposures is None)
+        require(once, "--distances says how far the detector is; leave --distance, or --exposures.")
         told = None if self.energy_kev == BeamlineOptions.energy_kev else self.energy_kev
         energy = told_energy(told, self.wavelength, self.medium_index)
         own = self if energy is None else replace(self, energy_kev=float(energy))
@@ -169,11 +173,19 @@ class BeamlineOptions(Directions):
             views = Views.from_rotations(rotations, self.detector, self.pixel_size)
             return beams.on(Exposures.of(views, self.energy_kev, self.distance, self.psf_sigma_px))
         views = self.on(self.detector, self.pixel_size)
-        return Exposures.of(views, self.energy_kev, self.distance, self.psf_sigma_px)
+        one = Exposures.of(views, self.energy_kev, self.distance, self.psf_sigma_px)
+        if not self.distances:
+            return one
+        several = one[list(range(len(one))) * len(self.distances)]
+        return replace(several, distance=[z for z in self.distances for _ in range(len(one))])  # type: ignore[arg-type]
 
     def split(self, count: int) -> np.ndarray:
-        """[count] bool: the frames that are held out."""
+        """[count] bool: the frames that are held out; of several distances, all frames of a pose, or none."""
         from ..scan import interleaved_split
+
+        if self.distances:
+            poses = replace(self, distances=()).split(count // len(self.distances))
+            return poses[[n % len(poses) for n in range(count)]]
 
         every = self.test_every
         require(every == 0 or every > 1, f"--test-every must be 0 (hold out none) or at least 2, but it is {every}.")

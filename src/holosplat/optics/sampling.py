@@ -6,6 +6,8 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from ..geometry import Grid
 from ..scan import Exposures
@@ -104,17 +106,65 @@ def _is_5_smooth(n: int) -> bool:
     return n == 1
 
 
+class SharedPoses:
+    """Which frames tell of one projection together: those of one pose, pixel, time and energy at several distances.
+
+    of: [V] int, the projection of each; any: whether there are such frames. Where poses are taken several times at one
+    distance alone, each frame stays by itself. Shifts may differ (`retrieval.contact` moves frames to each other).
+    """
+
+    def __init__(self, exposures: Exposures) -> None:
+        views, count = exposures.views, len(exposures)
+        optics = np.stack((views.relative, exposures.time, exposures.energy_kev), axis=1)
+        key = np.concatenate((views.rotations.reshape(count, 9).round(SAME_TURN), optics), axis=1)
+        _, pose = np.unique(key, axis=0, return_inverse=True)
+        pose = pose.reshape(-1)
+        nearest, farthest = np.full(count, np.inf), np.full(count, -np.inf)
+        np.minimum.at(nearest, pose, exposures.distance)
+        np.maximum.at(farthest, pose, exposures.distance)
+        several = (farthest > nearest)[pose]
+        self.any = bool(several.any())
+        _, of = np.unique(np.where(several, pose, count + np.arange(count)), return_inverse=True)
+        self.of = of.reshape(-1)
+        self._of, self._count = torch.from_numpy(self.of), torch.from_numpy(np.bincount(self.of))
+
+    def sum(self, values: Tensor) -> Tensor:
+        """Values [V, ...], each as the sum over the frames of its projection."""
+        if not self.any:
+            return values
+        of = self._of.to(values.device)
+        return values.new_zeros(len(self._count), *values.shape[1:]).index_add_(0, of, values).index_select(0, of)
+
+    def mean(self, values: Tensor) -> Tensor:
+        """Values [V, ...], each as the mean over the frames of its projection."""
+        if not self.any:
+            return values
+        count = self._count[self._of].reshape(-1, *(1,) * (values.ndim - 1))
+        return self.sum(values) / count.to(values)
+
+
+SAME_TURN = 6
+"""Decimals of matrices of one pose: a millionth of a radian turns no frame by a pixel."""
+
+
 def alike(exposures: Exposures, oversample: int = 0) -> Iterator[np.ndarray]:
     """Indices of views that share distance, blur and energy, and so a raster, of `MOST_SAMPLES` at most or one by one.
 
+    Frames of one projection (`SharedPoses`) stay together, beside those of others of the same distances.
     oversample: wave samples a pixel (0: as the first fringe needs).
     """
     optical = exposures.optical
     optics = np.stack((optical.distance, optical.psf_sigma_px, optical.energy_kev), axis=1)
-    for one in np.unique(optics, axis=0):
-        views = np.flatnonzero((optics == one).all(axis=1))
-        sample = exposures[views[:1]]
+    _, kind = np.unique(optics, axis=0, return_inverse=True)
+    kind, of = kind.reshape(-1), SharedPoses(exposures).of
+    order = np.lexsort((np.arange(len(of)), of))
+    poses = np.split(order, np.flatnonzero(np.diff(of[order])) + 1)
+    together: dict[tuple[int, ...], list[np.ndarray]] = {}
+    for pose in sorted(poses, key=lambda pose: pose[0]):
+        together.setdefault(tuple(sorted(kind[pose])), []).append(pose)
+    for _, same in sorted(together.items()):
+        sample = exposures[same[0]]
         finer = oversample or fringe_sampling(sample)
         rows, columns = sample.views.padded(padding(sample, finer)).refined(finer).shape
-        at_once = max(1, MOST_SAMPLES // (rows * columns))
-        yield from (views[i : i + at_once] for i in range(0, len(views), at_once))
+        at_once = max(1, MOST_SAMPLES // (rows * columns * len(same[0])))
+        yield from (np.concatenate(same[i : i + at_once]) for i in range(0, len(same), at_once))
