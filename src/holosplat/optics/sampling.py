@@ -107,7 +107,7 @@ def _is_5_smooth(n: int) -> bool:
 
 
 class SharedPoses:
-    """Which frames tell of one projection together: those of one pose, pixel, time and energy at several distances.
+    """Frames of one projection: those of one pose, pixel, time and photon energy at several distances.
 
     of: [V] int, the projection of each; any: whether there are such frames. Where poses are taken several times at one
     distance alone, each frame stays by itself. Shifts may differ (`retrieval.contact` moves frames to each other).

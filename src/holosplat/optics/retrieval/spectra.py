@@ -158,7 +158,7 @@ class Spectra:
     """The response H and the expected power S of the phase, both [V, H, W//2 + 1], and two standard deviations [V] of
     the frames: of the white noise alone, and of this noise with the model error; grain: power [V, H, W//2 + 1] of
     correlated noise beside both, None without any; leak: power [V, H, W//2 + 1] that a frame's edges carry here from
-    half a cycle away; poses: of which several frames tell together, whose power is then one. All float64."""
+    half a cycle away; poses: those that several frames show, which have one power. All float64."""
 
     response: Tensor
     power: Tensor
