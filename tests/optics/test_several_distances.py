@@ -59,6 +59,12 @@ def test_frames_of_one_pose_and_time_are_found():
     assert poses.mean(values).tolist() == [5.5, 11, 5.5, 11, 5, 6]
     assert not SharedPoses(replace(where, time=np.arange(6.0))).any
     assert not SharedPoses(replace(where, distance=FAR)).any
+    edge = 0.5 * max(SHAPE)
+    for turn_px, shared in ((0.4, True), (0.6, False)):
+        turned = of_poses([0, np.rad2deg(turn_px / edge)], [NEAR, FAR])
+        assert SharedPoses(turned).any is shared
+    dense = of_poses([0, 0.3, 0, 0.3], [NEAR, NEAR, FAR, FAR])  # each has one frame of each distance
+    assert SharedPoses(dense).of.tolist() == [0, 1, 0, 1]
     together = [sorted(index.tolist()) for index in alike(where)]
     assert sorted(together) == [[0, 1, 2, 3], [4, 5]]
 

@@ -109,24 +109,43 @@ def _is_5_smooth(n: int) -> bool:
 class SharedPoses:
     """Frames of one projection: those of one pose, pixel, time and photon energy at several distances.
 
-    of: [V] int, the projection of each; any: whether there are such frames. Where poses are taken several times at one
-    distance alone, each frame stays by itself. Shifts may differ (`retrieval.contact` moves frames to each other).
+    of: [V] int, the projection of each; any: whether there are such frames. Poses are one whose turn to each other
+    moves the edge of the field by less than half a pixel, as of frames that were aligned one by one. Where poses are
+    taken at one distance alone, each frame stays by itself. Shifts may differ: `retrieval.contact` moves frames to each
+    other.
     """
 
     def __init__(self, exposures: Exposures) -> None:
-        views, count = exposures.views, len(exposures)
-        optics = np.stack((views.relative, exposures.time, exposures.energy_kev), axis=1)
-        key = np.concatenate((views.rotations.reshape(count, 9).round(SAME_TURN), optics), axis=1)
-        _, pose = np.unique(key, axis=0, return_inverse=True)
-        pose = pose.reshape(-1)
-        nearest, farthest = np.full(count, np.inf), np.full(count, -np.inf)
-        np.minimum.at(nearest, pose, exposures.distance)
-        np.maximum.at(farthest, pose, exposures.distance)
-        several = (farthest > nearest)[pose]
-        self.any = bool(several.any())
-        _, of = np.unique(np.where(several, pose, count + np.arange(count)), return_inverse=True)
+        count = len(exposures)
+        pose = np.arange(count) if np.ptp(exposures.distance) == 0 else self._poses(exposures)
+        frames = np.bincount(pose, minlength=count)
+        self.any = bool((frames > 1).any())
+        _, of = np.unique(pose, return_inverse=True)
         self.of = of.reshape(-1)
         self._of, self._count = torch.from_numpy(self.of), torch.from_numpy(np.bincount(self.of))
+
+    @staticmethod
+    def _poses(exposures: Exposures) -> np.ndarray:
+        """The first frame of the pose of each [V]: the nearest pose that has none of its distance yet."""
+        views, turns = exposures.views, exposures.views.rotations
+        optics = np.stack((views.relative, exposures.time, exposures.energy_kev), axis=1)
+        _, kind = np.unique(optics, axis=0, return_inverse=True)
+        kind, pose = kind.reshape(-1), np.arange(len(exposures))
+        least = 2 * (1 - np.cos(1 / max(views.shape)))  # 3 - trace of a turn of half a pixel at the edge
+        for same in (np.flatnonzero(kind == k) for k in np.unique(kind)):
+            firsts: list[int] = []
+            has: list[set[float]] = []
+            for v in same.tolist():
+                far = 3 - np.einsum("nij,ij->n", turns[firsts], turns[v])
+                far[[exposures.distance[v] in distances for distances in has]] = np.inf
+                n = int(far.argmin()) if firsts else 0
+                if firsts and far[n] < least:
+                    pose[v] = firsts[n]
+                    has[n].add(exposures.distance[v])
+                else:
+                    firsts.append(v)
+                    has.append({exposures.distance[v]})
+        return pose
 
     def sum(self, values: Tensor) -> Tensor:
         """Values [V, ...], each as the sum over the frames of its projection."""
@@ -141,10 +160,6 @@ class SharedPoses:
             return values
         count = self._count[self._of].reshape(-1, *(1,) * (values.ndim - 1))
         return self.sum(values) / count.to(values)
-
-
-SAME_TURN = 6
-"""Decimals of matrices of one pose: a millionth of a radian turns no frame by a pixel."""
 
 
 def alike(exposures: Exposures, oversample: int = 0) -> Iterator[np.ndarray]:
