@@ -126,6 +126,23 @@ def test_frames_and_gradients_of_the_cpu_are_those_of_the_reference(made, index)
         assert (cpu.double() - reference).abs().max() < 5e-5 * reference.abs().max()
 
 
+def test_gradients_of_the_gpu_are_those_of_the_reference(gpu):
+    draw = torch.Generator().manual_seed(0)
+    lines, weights = (torch.randn(2, *shape, generator=draw, dtype=DOUBLE) for shape in ((1, 5, 9), (3, 5)))
+
+    def found(backend: str, dtype: torch.dtype) -> tuple[Tensor, ...]:
+        leaf = lines.to(gpu, dtype).requires_grad_()
+        z = torch.tensor([3e-6, 5e-6], dtype=DOUBLE, device=gpu).requires_grad_()
+        frame = ((3, 5), (1, 2), 1)
+        path = optical_path((5, 9), 0.5e-6, photon_energy(LAMBDA), z, np.zeros(2), frame, dtype)
+        assert path.beyond is not None
+        frames = hologram(leaf, [(0.7, 0.02)], path, backend)
+        return frames.detach(), *torch.autograd.grad((frames.double() * weights.to(gpu)).sum(), [leaf, z])
+
+    for cuda, reference in zip(found("cuda", torch.float32), found("reference", DOUBLE)):
+        assert (cuda.double() - reference).abs().max() < 1e-4 * reference.abs().max()
+
+
 def test_gradients_of_distances_are_differences():
     lines = torch.randn(4, 1, 23, 29, generator=torch.Generator().manual_seed(1), dtype=DOUBLE)
     weights = torch.randn(4, 9, 13, generator=torch.Generator().manual_seed(2), dtype=DOUBLE)
