@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from .geometry import Grid, Views
+from .units import beam_named
 
 EDGE = 128
 """Pixels of a picture along its longer edge, about: larger ones are thinned out."""
@@ -69,7 +70,7 @@ def of_scan(scan: Any) -> str:
     said = {
         "frames": f"{len(scan)} of {rows} × {columns} pixels, {int(scan.is_test.sum())} held out",
         "pixel": f"{1e6 * scan.views.pitch:.4g} µm",
-        "photon energy": _span(exposures.energy_kev, "keV"),
+        **dict([beam_named(exposures.energy_kev)]),
         "distance": _span(exposures.distance, "m"),
         "times": f"{len(np.unique(exposures.time))}",
     }

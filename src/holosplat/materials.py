@@ -24,9 +24,8 @@ from .checks import InputError, in_range, require
 from .matter import DeltaBeta as DeltaBeta
 from .scan import far_from_edges
 from .tables import read_table
+from .units import XRAYS_KEV, beam_named
 
-ENERGY_RANGE_KEV = (0.1, 400.0)
-"""Where Chantler's tables hold both f1 and f2 [keV]."""
 NAMES = "a name that `holosplat materials` lists, such as water, plasma, soft tissue or PMMA"
 """What messages say of named materials."""
 WITH = "H2O|D2O|T2O|NH3|HCl|H2O2|CH3OH|CH4O|C2H5OH|C2H6O"
@@ -114,7 +113,14 @@ class Compound:
 
     def delta_beta(self, energy_kev: float) -> DeltaBeta:
         """δ and β at `energy_kev` [keV, 0.1 to 400]; `InputError` outside."""
-        per_density = _per_density(self.formula, in_range("energy", energy_kev, *ENERGY_RANGE_KEV, unit="keV"))
+        low, high = XRAYS_KEV  # where Chantler's tables hold both f1 and f2
+        if not low <= energy_kev <= high:
+            raise InputError(
+                f"the energy must lie between {low:g} and {high:g} keV where a material is named, whose δ and β are "
+                f"tabulated for X-rays, but it is {energy_kev:g} keV ({beam_named(energy_kev)[1]}); of light and "
+                "electrons say a refractive index or δ/β instead of the material."
+            )
+        per_density = _per_density(self.formula, energy_kev)
         return DeltaBeta(*(self.density_g_cm3 * value for value in per_density))
 
 
@@ -156,6 +162,17 @@ class Mixture:
             delta += fraction * of_part.delta / part.density_g_cm3  # type: ignore[union-attr]
             beta += fraction * of_part.beta / part.density_g_cm3  # type: ignore[union-attr]
         return DeltaBeta(self.density_g_cm3 * delta, self.density_g_cm3 * beta)
+
+
+@dataclass(frozen=True)
+class Transparent:
+    """Matter of known refractive index and no absorption, for light: its δ, `1 - n/n_medium` against its medium."""
+
+    delta: float
+
+    def delta_beta(self, energy_kev: float) -> DeltaBeta:
+        """The same at every energy: no dispersion is known."""
+        return DeltaBeta(self.delta, 0.0)
 
 
 Material = Compound | Mixture
@@ -298,7 +315,9 @@ def read_material_table(path: str | Path) -> dict[str, Material]:
     return {pattern: _table_entry(f"{path}: material of {pattern!r}", entry) for pattern, entry in table.items()}
 
 
-def material_of(name: str, table: Mapping[str, Material], default: Material | None = None) -> Material:
+def material_of(
+    name: str, table: Mapping[str, Material], default: Material | Transparent | None = None
+) -> Material | Transparent:
     """The material of the first pattern in `table` that matches `name`, else `default`.
 
     name: a mesh's file name, with or without its folder or suffix. `InputError` when there is neither.

@@ -72,6 +72,8 @@ Pixels = Annotated[float, Within(0, 1e4, unit="pixels")]
 """Lengths on a detector [pixels], which has no more."""
 Metres = Annotated[float, Within(0, 1e4, unit="metres")]
 """Lengths of a beamline [m]."""
+Index = Annotated[float, Within(0.1, 10)]
+"""Refractive indices."""
 Small = Annotated[float, Within(0, 1, above=True, unit="metres")]
 """Sizes of a specimen, a pixel or a voxel [m]."""
 Seconds = Annotated[float, Within(0, 1e6, unit="seconds")]

@@ -13,6 +13,7 @@ from .display import of_scan
 from .divided_light import DividedLight
 from .frames import Binned, Cropped, Frames, Taken, binned_measured, divided, parts_of, picked
 from .geometry import Views
+from .units import BEAM_RANGE_KEV
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -64,7 +65,7 @@ class Exposures:
             array = np.broadcast_to(np.asarray(getattr(self, name), dtype=np.float64), (count,))
             object.__setattr__(self, name, array.copy())
         for energy in (*self.energy_kev, *([] if self.reference_kev is None else [self.reference_kev])):
-            in_range("energy", float(energy), *ENERGY_RANGE_KEV, unit="keV")
+            in_range("energy", float(energy), *BEAM_RANGE_KEV, unit="keV")
         for z in self.distance:
             checked_distance(float(z))
         finite("psf_sigma_px", self.psf_sigma_px)

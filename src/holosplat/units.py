@@ -8,10 +8,17 @@ from typing import TypeVar
 
 import numpy as np
 
-from .checks import InputError, finite, positive, require
+from .checks import InputError, finite, in_range, positive, require
 
 PLANCK_TIMES_C_KEV_M = 1.2398419843320026e-9
 """h·c in keV·m (CODATA 2018, exact)."""
+
+XRAYS_KEV = (0.1, 400.0)
+"""Energies [keV] that are said as such; light and electrons outside are said by their wavelength."""
+WAVELENGTH_RANGE_M = (1.24e-12, 1e-3)
+"""From electrons of 600 kV to terahertz waves [m]."""
+BEAM_RANGE_KEV = (PLANCK_TIMES_C_KEV_M / WAVELENGTH_RANGE_M[1], 1000.0)
+"""The same as photon energies [keV]."""
 
 PREFIXES = {"": 0, "kilo": 3, "deci": -1, "centi": -2, "milli": -3, "micro": -6, "nano": -9, "pico": -12}
 """Words before a unit, and their powers of ten."""
@@ -65,6 +72,26 @@ def wavelength(energy_kev: Energy) -> Energy:
 def wavenumber(energy_kev: Energy) -> Energy:
     """Wavenumber k = 2π/λ [rad/m] of photons of `energy_kev` [keV]."""
     return 2 * math.pi / wavelength(energy_kev)
+
+
+def photon_energy(wavelength: float, medium_index: float = 1.0) -> float:
+    """Energy [keV] of photons that have in vacuum the wavelength which light of `wavelength` [m] has in a medium.
+
+    medium_index: its refractive index n. `E = hc n/λ`, so that `units.wavelength` of it is λ/n. Of electrons it is a
+    name for their wavelength alone. Errors: `InputError` for numbers out of range.
+    """
+    index = positive("--medium-index", medium_index)
+    return PLANCK_TIMES_C_KEV_M / in_range("--wavelength", wavelength / index, *WAVELENGTH_RANGE_M, unit="metres")
+
+
+def beam_named(energies_kev: np.ndarray | float) -> tuple[str, str]:
+    """What a table says of `energies_kev` [keV]: photon energies of X-rays, else wavelengths in the medium."""
+    energies = np.atleast_1d(np.asarray(energies_kev, dtype=np.float64))
+    if ((energies >= XRAYS_KEV[0]) & (energies <= XRAYS_KEV[1])).all():
+        return "photon energy", f"{span(energies)} keV"
+    lengths = wavelength(energies)
+    unit, factor = ("pm", 1e12) if lengths.max() < 1e-9 else length_unit(float(lengths.max()))
+    return "wavelength", f"{span(factor * lengths)} {unit}"
 
 
 def plain(value: float, digits: int = 3) -> str:

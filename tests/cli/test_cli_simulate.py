@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from helpers.cli import BEAM, COLUMNS, MATTER, PIXEL, ROWS, holosplat, simulate, worked
+from helpers.cli import BEAM, COLUMNS, MATTER, PIXEL, ROWS, holosplat, refused, simulate, worked
 from holosplat.geometry import Grid, Views
 from holosplat.io.beams import Beams, write_beams
 from holosplat.io.nxtomo import read_scan
@@ -44,6 +44,31 @@ def test_angles_may_be_listed_and_negative(shop, tmp_path):
     wanted = Views.from_angles([-30, 0, 45.5, -10], (ROWS, COLUMNS), PIXEL)
     np.testing.assert_allclose(read_scan(out).views.rotations, wanted.rotations, atol=1e-12)
     assert not read_scan(out).is_test.any()
+
+
+def test_all_views_may_be_taken_at_several_distances(shop, tmp_path):
+    out = tmp_path / "scan.nxs"
+    beam = ("--detector", ROWS, COLUMNS, "--views", 3, "--test-every", 3, "--pixel-size", PIXEL)
+    worked(holosplat("simulate", *shop.cells, *beam, "--distances", 0.1, "0", 0.3, "--out", out))
+    found = read_scan(out)
+    assert found.exposures.distance.tolist() == [0.1] * 3 + [0.0] * 3 + [0.3] * 3
+    assert np.array_equal(found.views.rotations, np.tile(found.views.rotations[:3], (3, 1, 1)))
+    assert found.is_test.tolist() == [False, False, True] * 3
+    spread = found.frames.reshape(3, -1).std(axis=1)
+    assert spread[2] > spread[0] > 10 * spread[1]
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (("--distance", 0.2), "distances says how far the detector is; leave"),
+        (("--source-distance", 1, "--cone"), "distances is of parallel light; leave"),
+    ],
+)
+def test_several_distances_that_contradict_are_refused(more, said, shop, tmp_path):
+    beam = ("--detector", ROWS, COLUMNS, "--views", 3, "--distances", 0.1, 0.3)
+    refused(holosplat("simulate", *shop.cells, *beam, *more, "--out", tmp_path / "scan.nxs"), said)
+    assert not (tmp_path / "scan.nxs").exists()
 
 
 def test_poses_may_be_matrices(shop, tmp_path):

@@ -30,9 +30,11 @@ def at(lambda_z: float) -> float:
     return lambda_z * PITCH**2 / LAMBDA
 
 
-def exposures(shape: tuple[int, int] = SHAPE, distance=HOLOGRAPHIC, psf: float = 0.0, count: int = 1) -> Exposures:
-    """Exposures from one side, with one or more distances [m]."""
-    views = Views.from_angles([0.0] * count, shape, PITCH)
+def exposures(
+    shape: tuple[int, int] = SHAPE, distance: float | np.ndarray = HOLOGRAPHIC, psf: float = 0.0, count: int = 1
+) -> Exposures:
+    """Exposures, each of a pose of its own, with one or more distances [m]."""
+    views = Views.from_angles(10.0 * np.arange(count), shape, PITCH)
     return replace(Exposures.of(views, ENERGY, 1.0, psf), distance=np.broadcast_to(distance, count))
 
 

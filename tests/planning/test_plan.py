@@ -114,10 +114,12 @@ def test_the_frame_is_that_of_a_simulated_detector(shape, pixel):
 
 
 def test_equal_fresnel_numbers_and_phases_give_equal_frames():
-    """All lengths across twice as large, the distance four times, δ half: the same contrast in every pixel."""
-    small = Made(ellipsoid(3e-6, 2e-6, 2.5e-6), WATER, None, DeltaBeta(2e-7, 1e-9))
-    large = Made(ellipsoid(6e-6, 4e-6, 5e-6), WATER, None, DeltaBeta(1e-7, 0.5e-9))
-    one, other = (visibility(*pair) for pair in ((small, Setup(12, 0.05, 7e-7)), (large, Setup(12, 0.2, 14e-7))))
+    """All lengths across twice as large, the distance four times, δ half: the same contrast in every pixel.
+
+    Pixels are so large that Fresnel's kernel, whose law this is, is exact to rounding."""
+    small = Made(ellipsoid(48e-6, 32e-6, 40e-6), WATER, None, DeltaBeta(1.25e-8, 6.25e-11))
+    large = Made(ellipsoid(96e-6, 64e-6, 80e-6), WATER, None, DeltaBeta(6.25e-9, 3.125e-11))
+    one, other = (visibility(*pair) for pair in ((small, Setup(12, 12.8, 112e-7)), (large, Setup(12, 51.2, 224e-7))))
     np.testing.assert_allclose(other.middle, one.middle, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(other.information, one.information, rtol=1e-9)
     assert other.spread == pytest.approx(2 * one.spread, rel=1e-9)

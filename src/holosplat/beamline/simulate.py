@@ -14,7 +14,7 @@ import torch
 from ..backends import Backend, device, resolve
 from ..checks import InputError, in_range, require, require_regular
 from ..io.vtk import read_meshes
-from ..materials import HAEMOGLOBIN, DeltaBeta, Material, material_of
+from ..materials import HAEMOGLOBIN, DeltaBeta, Material, Transparent, material_of
 from ..memory import memory_kept
 from ..model import Instrument, Model
 from ..optics.coherence import Spectrum
@@ -263,7 +263,7 @@ FARTHEST = 1.0
 class Filling:
     """The materials of mesh files and the medium around them."""
 
-    material: Material | None = HAEMOGLOBIN
+    material: Material | Transparent | None = HAEMOGLOBIN
     """Material of meshes that no pattern of `table` matches (None: every mesh must match one)."""
     medium: Material | None = None
     """Material around the meshes; δ and β are differences to it (None: vacuum)."""

@@ -11,11 +11,12 @@ from tyro.conf import UseAppendAction, arg
 from ..beamline.light import UnevenLight
 from ..beamline.misalignment import Directions
 from ..checks import InputError, require
-from ..io.reading import ends_of
+from ..io.reading import ends_of, told_energy
 from ..ranges import (
     Angle,
     Frequency,
     Grams,
+    Index,
     Many,
     Metres,
     Natural,
@@ -83,13 +84,22 @@ class MaterialOptions:
     """Formula or name of what surrounds the meshes; none means vacuum."""
     medium_density: Grams | None = None
     """The medium's density [g/cm³]."""
+    index: Index | None = None
+    """Or, of light: their refractive index, of matter that does not absorb, in a medium of --medium-index."""
     materials: Path | None = None
     """JSON or TOML table of materials by mesh file name, for scenes of several."""
 
-    def filling(self) -> Filling:
-        """The materials that the options name."""
+    def filling(self, medium_index: float | None = None) -> Filling:
+        """The materials that the options name, in a medium of so large a refractive index for light."""
         from ..beamline.simulate import Filling
-        from ..materials import parse_material, read_material_table
+        from ..materials import Transparent, parse_material, read_material_table
+
+        if self.index is not None:
+            named = (self.material, self.density, self.medium, self.medium_density, self.materials)
+            require(
+                named == (None,) * 5, "--index says what fills the meshes; leave --material, --medium and the like."
+            )
+            return Filling(Transparent(1 - self.index / (1.0 if medium_index is None else medium_index)))
 
         require(self.medium is not None or self.medium_density is None, "--medium-density needs --medium.")
         table = read_material_table(self.materials) if self.materials else {}
@@ -111,8 +121,14 @@ class BeamlineOptions(Directions):
     """Rows and columns of the detector [pixels]."""
     energy_kev: float = 20.0
     """Photon energy [keV]."""
+    wavelength: Small | None = None
+    """Or: wavelength in vacuum [m], of light, or of electrons."""
+    medium_index: Index | None = None
+    """With it: refractive index of the medium in which light travels and matter lies (default: 1)."""
     distance: Metres = 0.1
     """Effective propagation distance [m]."""
+    distances: tuple[Metres, ...] = ()
+    """Or several: all views are taken at each of them [m], and frames of a pose are used together."""
     pixel_size: Small = 3.2e-6
     """Effective pixel size [m]."""
     psf_sigma_px: Pixels = 0.0
@@ -123,16 +139,22 @@ class BeamlineOptions(Directions):
     """One view in so many is held out of the fit (0: none)."""
 
     def told(self) -> BeamlineOptions:
-        """The same with what the file of --exposures says; `InputError` for options that say it, too."""
+        """The same with one photon energy, and what the file of --exposures says; `InputError` for options that say it
+        twice."""
+        once = not self.distances or (self.distance == BeamlineOptions.distance and self.exposures is None)
+        require(once, "--distances says how far the detector is; leave --distance, or --exposures.")
+        told = None if self.energy_kev == BeamlineOptions.energy_kev else self.energy_kev
+        energy = told_energy(told, self.wavelength, self.medium_index)
+        own = self if energy is None else replace(self, energy_kev=float(energy))
         if self.exposures is None:
-            return self
+            return own
         from ..io.beams import read_beams
 
         said = read_beams(self.exposures).scalars()
         for name in said:
-            twice = getattr(self, name) != getattr(BeamlineOptions, name)
+            twice = getattr(own, name) != getattr(BeamlineOptions, name)
             require(not twice, f"--exposures {self.exposures} says it already; leave --{name.replace('_', '-')}.")
-        return replace(self, **said)
+        return replace(own, **said)
 
     def planned(self) -> Exposures:
         """How each frame is taken."""
@@ -151,11 +173,19 @@ class BeamlineOptions(Directions):
             views = Views.from_rotations(rotations, self.detector, self.pixel_size)
             return beams.on(Exposures.of(views, self.energy_kev, self.distance, self.psf_sigma_px))
         views = self.on(self.detector, self.pixel_size)
-        return Exposures.of(views, self.energy_kev, self.distance, self.psf_sigma_px)
+        one = Exposures.of(views, self.energy_kev, self.distance, self.psf_sigma_px)
+        if not self.distances:
+            return one
+        several = one[list(range(len(one))) * len(self.distances)]
+        return replace(several, distance=[z for z in self.distances for _ in range(len(one))])  # type: ignore[arg-type]
 
     def split(self, count: int) -> np.ndarray:
-        """[count] bool: the frames that are held out."""
+        """[count] bool: the frames that are held out; of several distances, all frames of a pose, or none."""
         from ..scan import interleaved_split
+
+        if self.distances:
+            poses = replace(self, distances=()).split(count // len(self.distances))
+            return poses[[n % len(poses) for n in range(count)]]
 
         every = self.test_every
         require(every == 0 or every > 1, f"--test-every must be 0 (hold out none) or at least 2, but it is {every}.")

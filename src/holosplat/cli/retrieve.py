@@ -47,6 +47,8 @@ class OneMaterial:
     """The medium's density [g/cm³]."""
     delta_beta: Signed | None = None
     """Or: only the ratio δ/β is known; it gives the phase, and no thickness."""
+    contrast: Literal["above", "below"] = "above"
+    """With it: side of the medium's δ on which matter lies; cells in light, whose index is larger, lie below."""
 
     def at(self, energy_kev: float) -> tuple[DeltaBeta, bool]:
         """δ and β at `energy_kev` [keV], and whether δ is known, not only δ/β."""
@@ -55,7 +57,9 @@ class OneMaterial:
         prior = PriorOptions(material, density, self.medium, self.medium_density, self.delta_beta).prior(energy_kev)
         require(prior.fixes_ratio, "retrieve needs --material or --delta-beta, but neither is given; add one of them.")
         if isinstance(prior, KnownRatio):
-            return DeltaBeta(STAND_IN_DELTA, STAND_IN_DELTA / prior.ratio), False
+            delta = STAND_IN_DELTA if self.contrast == "above" else -STAND_IN_DELTA
+            return DeltaBeta(delta, delta / prior.ratio), False
+        require(self.contrast == "above", "--contrast goes with --delta-beta; a material says it; leave --contrast.")
         return prior.materials[0], True
 
 

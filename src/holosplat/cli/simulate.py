@@ -169,9 +169,11 @@ def simulate(
     resolve(experiment.backend)  # before anything is read
     motion, source, beamline = experiment.motion, experiment.source, beamline.told()
     require(beamline.exposures is None or not source.cone, "--cone goes with --distance; leave it, or --exposures.")
+    from_afar = not beamline.distances or source.source_distance is None
+    require(from_afar, "--distances is of parallel light; leave --source-distance, which blurs each of them otherwise.")
     of_source, beamline = source.facts(beamline), source.applied(beamline)
     named = imaged.generated.in_medium(filling)
-    views, filled = beamline.planned(), named.filling()
+    views, filled = beamline.planned(), named.filling(beamline.medium_index)
     true_views = experiment.misalignment.errors().true_exposures(views)
     with ProgressBar() as bar:
         times = imaged.generated.timing(motion) if imaged.generated.specimen else np.zeros(1)
@@ -188,7 +190,8 @@ def simulate(
     _require_few(len(views) * len(times))
     how = replace(experiment.noise.simulation(motion.shutter(), experiment.light), backend=experiment.backend)
     _say_of_missing_field(specimen, true_views.views, beamline.pixel_size)
-    split = beamline.split(len(views) if motion.hold_out == "views" else len(times))
+    of_poses = motion.hold_out == "views"
+    split = beamline.split(len(views)) if of_poses else replace(beamline, distances=()).split(len(times))
     is_test = held_out(split, len(views), len(times), motion.hold_out)
     nominal, true, volumes = views.repeated(times), true_views.repeated(times), truth.volumes(len(times))
     facts = {**how.provenance(true), **specimen.facts, **of_source, "medium": named.medium or "vacuum"}

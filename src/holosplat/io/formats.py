@@ -103,6 +103,7 @@ LOADERS: tuple[Loader, ...] = (
     arrays.LOADER,
     images.TIFF,
     images.LOADER,
+    images.NIKON,
     euxfel.LOADER,
     nerf_synthetic.LOADER,
     r2_gaussian.LOADER,

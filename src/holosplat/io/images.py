@@ -8,6 +8,7 @@ Scans from and to TIFF files (float32) beside a `scan.json` of how each frame wa
 
 from __future__ import annotations
 
+import configparser
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -17,7 +18,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..checks import InputError, finite, note, require
+from ..checks import InputError, finite, note, require, require_regular
 from ..scan import Scan
 from .angles import angles_of, read_angles, tell_angles
 from .atomic import atomic_folder
@@ -215,6 +216,79 @@ def _recognises(path: Path) -> bool:
 LOADER = Loader(
     *("images", f"images ({', '.join(IMAGES)}), one file or a folder of them, or an array (.npy)", _recognises),
     *(reader(open_images), (*RAW_TAKES, "files", "black", "white"), open_images, True),
+)
+
+
+XTEKCT = ".xtekct"
+SECTION = "XTekCT"
+
+
+@contextmanager
+def open_nikon(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Iterator[ScanFile]:
+    """The projections that an `.xtekct` file of a Nikon scanner describes: images beside it, or in its InputFolderName,
+    whose names begin with its Name.
+
+    Distances and pixels [mm] are those at the detector of a cone of rays, which `magnified` makes parallel; images are
+    divided by WhiteLevel. given: what the file does not say, by name (`TAKES`), such as the photon energy. Errors:
+    `InputError` for entries that are missing or no numbers, and for other numbers of images.
+    """
+    source = Path(path)
+    entry = _nikon_entries(source)
+
+    def number(name: str) -> float:
+        try:
+            found = float(entry[name])
+        except (KeyError, ValueError):
+            found = np.nan
+        require(
+            bool(np.isfinite(found)),
+            f"{path}: {name} must be a number, but it is {entry.get(name, 'missing')}; correct it.",
+        )
+        return found
+
+    folder = source.parent / entry.get("InputFolderName", "").replace("\\", "/")
+    require(folder.is_dir(), f"{path}: InputFolderName must be a folder, but {folder} is none; correct it.")
+    name = entry.get("Name", "")
+    files = [file for file in images_in(folder, given.get("files")) if file.name.startswith(name)]
+    require(len(files) > 0, f"{folder} must hold images whose names begin with {name!r}, but it holds none.")
+    stack, count = ImageStack.of(in_order(files)), int(number("Projections"))
+    require(
+        stack.shape[0] == count,
+        f"{path}: Projections must be the number of images named {name}, {stack.shape[0]}, but it is {count}; choose "
+        "them by --files.",
+    )
+    across, down = (1e-3 * number(f"DetectorPixelSize{axis}") for axis in "XY")
+    require(
+        bool(np.isclose(across, down)), f"{path}: detector pixels must be square, but they are {across} by {down} m."
+    )
+    before, behind = (1e-3 * number(name) for name in ("SrcToObject", "SrcToDetector"))
+    require(behind > before > 0, f"{path}: SrcToDetector must be above SrcToObject, and that above 0; correct them.")
+    found: dict[str, Any] = {"distance": behind - before, "pixel_size": across, "source_distance": before}
+    found["angles_deg"] = number("InitialAngle") + number("AngularStep") * np.arange(count)
+    white = np.full((1, *stack.shape[1:]), number("WhiteLevel"))
+    require(bool(white[0, 0, 0] > 0), f"{path}: WhiteLevel must be above 0, but it is {white[0, 0, 0]:g}; correct it.")
+    file = ScanFile.of(source, [(PROJECTION, stack), (FLAT, white)], given, found)
+    _tell_order(file)
+    yield file
+
+
+def _nikon_entries(path: Path) -> Mapping[str, str]:
+    """The entries of the section [XTekCT]."""
+    require_regular(path, f"a file of a Nikon scanner ({XTEKCT})")
+    parser = configparser.ConfigParser(interpolation=None, strict=False)
+    parser.optionxform = str  # type: ignore[assignment, method-assign]  # capitals matter
+    try:
+        parser.read_string(path.read_text(encoding="utf-8-sig", errors="replace"))
+    except configparser.Error as error:
+        first = error.message.splitlines()[0]
+        raise InputError(f"{path} must be a text file of [sections], but it is none: {first}") from None
+    require(parser.has_section(SECTION), f"{path} must have a section [{SECTION}], but it has none; name another file.")
+    return parser[SECTION]
+
+
+NIKON = Loader(
+    *("nikon", f"an {XTEKCT} file of a Nikon scanner", lambda path: path.is_file() and path.suffix.lower() == XTEKCT),
+    *(reader(open_nikon), (*RAW_TAKES, "files"), open_nikon),
 )
 
 

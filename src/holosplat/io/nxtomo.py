@@ -14,7 +14,8 @@ import numpy as np
 
 from ..checks import finite, require, shaped
 from ..divided_light import DividedLight
-from ..scan import Exposures, Scan
+from ..scan import ENERGY_RANGE_KEV, Exposures, Scan
+from ..units import wavelength
 from ..version import __version__
 from .hdf5_writing import new_hdf5, put, room_for
 from .light import LIGHT, write_divided_light
@@ -162,9 +163,13 @@ def _put(group: h5py.Group, name: str, value: np.ndarray | float, units: str) ->
 
 def _write_instrument(instrument: h5py.Group, exposures: Exposures, raw: RawLayout | None) -> h5py.Dataset:
     source = _group(instrument, "source", "NXsource")
-    source["probe"] = "x-ray"
     energy = float(exposures.energy_kev[0]) if exposures.has_one_energy else exposures.energy_kev
-    _put(_group(instrument, "beam", "NXbeam"), "incident_energy", energy, "keV")
+    beam = _group(instrument, "beam", "NXbeam")
+    if exposures.energy_kev.min() < ENERGY_RANGE_KEV[0]:  # light; of electrons a wavelength is told as an energy
+        _put(beam, "incident_wavelength", wavelength(np.asarray(energy)), "m")
+    else:
+        source["probe"] = "x-ray"
+        _put(beam, "incident_energy", energy, "keV")
     detector = _group(instrument, "detector", "NXdetector")
     shape = (len(exposures), *exposures.views.shape)
     data = room_for(detector, "data", shape, np.uint16 if raw else np.float32, chunk=(1, *shape[1:]))

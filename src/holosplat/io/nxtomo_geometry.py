@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
 
 import h5py
 import numpy as np
 
-from ..checks import InputError, in_range, note, require, warn
+from ..checks import InputError, note, require, warn
 from ..geometry import Views
 from ..units import ANGLE_UNITS, LENGTH_UNITS, format_length, unit_factor
 from .hdf5 import Fields, attribute_text
+from .raw_file import magnified, said
 
 FLIPS = ("instrument/detector/y_flipped", "instrument/detector/x_flipped")
 SHIFT = "instrument/detector/shift"
@@ -22,11 +24,6 @@ SOURCES = ("instrument/source/distance", "sample/source_distance", "source/dista
 MOVES = tuple(f"sample/{axis}_translation" for axis in "xyz")
 TRANSFORMATIONS = "instrument/detector/transformations"
 COORDINATES = "NeXus_Coordinate_System"
-FARTHEST_M = 1e4
-PARALLEL = 1.001
-"""A smaller magnification is that of a parallel beam."""
-WIDEST = 0.02
-"""Tangent of half the angle of a cone of rays, at most, that is taken for parallel at the object."""
 
 
 def flips_of(fields: Fields) -> tuple[bool, bool]:
@@ -117,40 +114,30 @@ def tell_moves(fields: Fields, per_frame: Callable[[str], np.ndarray], pixel: fl
             )
 
 
-def magnification(fields: Fields, per_frame: Callable[[str], np.ndarray], detector: str) -> np.ndarray | float:
-    """(R + z) / R of a source R before the sample, and the detector z behind it, [n] or one number.
+def magnification(
+    fields: Fields, per_frame: Callable[[str], np.ndarray], detector: str, given: Mapping[str, Any]
+) -> np.ndarray | float:
+    """(R + z) / R of a source R before the sample, and the detector z behind it, [n] or one number; both as they are
+    given (`Told.source_distance`), or else as the file says.
 
     Errors: `InputError` for a cone of rays too wide for parallel ones, and for a distance that cannot be.
     """
-    name = fields.find(*SOURCES)
-    if name is None or not fields.find(detector):
-        return 1.0
-    source = np.abs(fields.numbers(name).reshape(-1)) * fields.unit(name, LENGTH_UNITS, "m")
-    if not (np.isfinite(source).all() and source.any()):
-        return 1.0
-    before = in_range(fields.label(name), float(source[0]), 1e-6, FARTHEST_M, unit="metres")
-    found = (before + np.abs(per_frame(detector)) * fields.unit(detector, LENGTH_UNITS, "m")) / before
-    if found.max() < PARALLEL:
-        return 1.0
-    _require_narrow(fields, name, float(found.min()), before)
-    note(
-        f"{fields.label(name)}: the source is {before:.4g} m before the sample; pixels and distance are divided by the "
-        f"magnification of {found[0]:.4g} where the file has those at the detector; --pixel-size and --distance say "
-        "otherwise"
-    )
-    return found
-
-
-def _require_narrow(fields: Fields, name: str, magnified: float, before: float) -> None:
-    """`InputError` for a cone of rays that is no parallel beam at the object."""
+    name, told = fields.find(*SOURCES), given.get("source_distance")
+    if told is not None:
+        label, before = "--source-distance", told
+        behind = said(given, "distance")
+    else:
+        if name is None or not fields.find(detector):
+            return 1.0
+        source = np.abs(fields.numbers(name).reshape(-1)) * fields.unit(name, LENGTH_UNITS, "m")
+        if not (np.isfinite(source).all() and source.any()):
+            return 1.0
+        label, before, behind = fields.label(name), float(source[0]), None
+    if behind is None:
+        behind = np.abs(per_frame(fields.need(detector))) * fields.unit(detector, LENGTH_UNITS, "m")
     data, size = fields.find("instrument/detector/data", "data/data"), fields.find("instrument/detector/x_pixel_size")
-    if data is None or size is None:
-        return
-    pixel = float(fields.numbers(size).reshape(-1)[0]) * fields.unit(size, LENGTH_UNITS, "m")
-    tangent = 0.5 * max(fields.dataset(data).shape[1:]) * pixel / (before * magnified)
-    if tangent > WIDEST:
-        raise InputError(
-            f"{fields.label(name)}: a source {before:.4g} m before the sample makes a cone of rays, tangent of half "
-            f"its angle {tangent:.2g}, but beams are parallel here (up to {WIDEST}); crop the frames, or leave it out "
-            "if the beam is parallel."
-        )
+    pixel = said(given, "pixel_size") if told is not None else None
+    if pixel is None and size is not None:
+        pixel = float(fields.numbers(size).reshape(-1)[0]) * fields.unit(size, LENGTH_UNITS, "m")
+    shape = fields.dataset(data).shape[1:] if data is not None and pixel is not None else (0, 0)
+    return magnified(label, before, behind, pixel or 0.0, shape)

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from ..checks import UnsaidError, in_range, require
+from ..checks import InputError, UnsaidError, in_range, note, require
 from ..divided_light import DividedLight
 from ..geometry import Views, rotation_y
 from ..preprocess.flat_field import mean_frame
-from ..scan import DISTANCE_RANGE_M, ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, checked_distance
+from ..scan import DISTANCE_RANGE_M, PIXEL_RANGE_M, Exposures, checked_distance
+from ..units import BEAM_RANGE_KEV
 from .stacks import ImageStack
 
 if TYPE_CHECKING:
@@ -22,13 +23,18 @@ if TYPE_CHECKING:
 
 PROJECTION, FLAT, DARK, INVALID = range(4)
 
-TAKES = ("energy_kev", "distance", "pixel_size", "angles_deg", "flats", "darks")
+TAKES = ("energy_kev", "distance", "pixel_size", "source_distance", "angles_deg", "flats", "darks")
 """What may be said beside a file, and then goes before what the file says."""
+FARTHEST_M = 1e4
+PARALLEL = 1.001
+"""A smaller magnification is that of a parallel beam."""
+WIDEST = 0.02
+"""Tangent of half the angle of a cone of rays, at most, that is taken for parallel at the object."""
 RAW_TAKES = (*TAKES, "leave_out")
 """The same for files whose flats and darks are read frame by frame."""
 NOTHING: Mapping[str, Any] = {}
 RANGES = {
-    "energy_kev": (ENERGY_RANGE_KEV, "keV"),
+    "energy_kev": (BEAM_RANGE_KEV, "keV"),
     "distance": (DISTANCE_RANGE_M, "metres"),
     "pixel_size": (PIXEL_RANGE_M, "metres"),
 }
@@ -181,6 +187,35 @@ def stand_in(*names: str) -> dict[str, float]:
     return {name: STAND_INS[name] for name in names}
 
 
+def magnified(
+    label: str, source: float, distance: float | np.ndarray, pixel: float, shape: Sequence[int]
+) -> float | np.ndarray:
+    """Magnification (R + z) / R of a source R before the sample, of detectors z behind it; 1 for a parallel beam.
+
+    label: what messages call the source; source, distance: R and z [m]; pixel: of the detector [m]; shape: of frames.
+    Distance and pixel over it are those of the parallel beam of the same frames (`optics.coherence`), where the object
+    is thin against R. Errors: `InputError` for a cone of rays too wide for that, and a distance that cannot be.
+    """
+    before = in_range(label, source, 1e-6, FARTHEST_M, unit="metres")
+    found = 1 + np.asarray(distance, dtype=np.float64) / before
+    if found.max() < PARALLEL:
+        return 1.0
+    half = 0.5 * max(shape)
+    tangent = half * pixel / (before * float(found.min()))
+    if tangent > WIDEST:
+        raise InputError(
+            f"{label}: a source {before:.4g} m before the sample makes a cone of rays, tangent of half its angle "
+            f"{tangent:.2g}, but beams are parallel here (up to {WIDEST}); crop the frames, or leave it out if the "
+            "beam is parallel."
+        )
+    note(
+        f"{label}: the source is {before:.4g} m before the sample; pixels and distance at the detector are divided by "
+        f"the magnification of {float(found.max()):.4g}; at the frames' edge, the front and the back of an object as "
+        f"deep as they are wide lie {2 * tangent * half:.2g} pixels apart, which is not modelled"
+    )
+    return found if found.ndim else float(found)
+
+
 def require_said(label: str, missing: Sequence[str]) -> None:
     """`UnsaidError` that names the options for what neither a file nor the command says, all of it at once."""
     if missing:
@@ -210,11 +245,20 @@ def exposures_of(
 ) -> Exposures:
     """Exposures of the frames `projections` [N] bool of (H, W) pixels: what is `given`, or else `found` in the file.
 
-    Both by name: energy_kev [keV], distance [m], pixel_size [m], angles_deg. One projection needs no angle.
+    Both by name: energy_kev [keV], distance [m], pixel_size [m], angles_deg. One projection needs no angle. Where the
+    distance of the source is given, `source_distance` [m], all are the detector's own; where it is found, those that
+    are found (`magnified`).
     """
     told = {name: said({name: found.get(name) if given.get(name) is None else given[name]}, name) for name in RANGES}
     values = {name: value for name, value in told.items() if value is not None}
     require_said(label, [name for name in RANGES if name not in values])
+    told_source = given.get("source_distance")
+    if (source := found.get("source_distance") if told_source is None else told_source) is not None:
+        own = {name for name in ("distance", "pixel_size") if told_source is not None or given.get(name) is None}
+        behind, pixel = ((values if name in own else found).get(name, 0.0) for name in ("distance", "pixel_size"))
+        where = f"{label}: the source" if told_source is None else "--source-distance"
+        larger = magnified(where, source, behind, pixel, shape)
+        values |= {name: values[name] / float(larger) for name in own}
     angles = given["angles_deg"] if given.get("angles_deg") is not None else found.get("angles_deg")
     if angles is None and int(projections.sum()) == 1:
         angles = np.zeros(1)

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from ..checks import InputError, require
-from ..ranges import Frequency, Natural, Signed, Small, ranged
+from ..ranges import Frequency, Index, Natural, Positive, Signed, Small, ranged
 from ..tables import LARGEST, from_table, number_in, shown, to_table
+from ..units import photon_energy
 from .angles import read_angles, tell_angles, tell_views
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 Sense = Literal["clockwise", "anticlockwise"]
 
-OWN_WAY = ("angles", "axis_column", "sense", "tube", "exposures", "allow_external")
+OWN_WAY = ("wavelength", "medium_index", "angles", "axis_column", "sense", "tube", "exposures", "allow_external")
 """Fields of `Told` that no loader takes by their own name."""
 
 
@@ -33,10 +34,16 @@ class Told:
 
     energy_kev: float | str | None = None
     """Photon energy [keV], or a range LOW:HIGH for `reconstruct` (default: as the files say)."""
+    wavelength: Small | None = None
+    """Or: wavelength in vacuum [m], of light, or of electrons (default: as the files say)."""
+    medium_index: Index | None = None
+    """With it: refractive index of the medium in which light travels and matter lies (default: 1)."""
     distance: float | str | None = None
     """Effective propagation distance [m], or a range LOW:HIGH for `reconstruct` (default: as the files say)."""
     pixel_size: Small | None = None
     """Effective pixel size [m] (default: as the files say)."""
+    source_distance: Positive | None = None
+    """Distance from a point source to the sample [m]; distance and pixel are then those of the detector itself."""
     angles: Path | None = None
     """Text file of the frames' angles [degrees], one a line, or in a column that its first line names (default: as the
     files say)."""
@@ -78,6 +85,22 @@ class Told:
     white: Signed | None = None
     """Grey images, nerf-synthetic: intensity of white pixels, relative to the flat field (default: 1)."""
 
+    def energy(self) -> float | str | None:
+        """The photon energy [keV], or the range of it, that is said: that of the wavelength, if that is said instead.
+
+        Errors: `InputError` for both of them, and for energies that are none of X-rays.
+        """
+        if isinstance(self.energy_kev, float | int):
+            from ..scan import ENERGY_RANGE_KEV  # needs geometry, which reading an option does not
+
+            low, high = ENERGY_RANGE_KEV
+            require(
+                low <= self.energy_kev <= high,
+                f"--energy-kev must lie between {low:g} and {high:g} keV, but it is {self.energy_kev:g}; check its "
+                "unit, or say light and electrons by --wavelength.",
+            )
+        return told_energy(self.energy_kev, self.wavelength, self.medium_index)
+
     def ranges(self) -> dict[str, tuple[float, float]]:
         """What is said as a range LOW:HIGH, by name."""
         said = {"energy_kev": self.energy_kev, "distance": self.distance}
@@ -96,6 +119,8 @@ class Told:
             option, text = f"--{name.replace('_', '-')}", getattr(self, name)
             raise InputError(f"{option} must be one number here, but it is {text!r}; a range is for reconstruct alone.")
         said = {name: value for name, value in vars(self).items() if value is not None and name not in OWN_WAY}
+        if (energy := self.energy()) is not None:
+            said["energy_kev"] = energy
         beams = self._beams()
         said |= {name: value for name, value in (beams.scalars() if beams else {}).items() if name in takes}
         if self.angles is None:
@@ -217,6 +242,18 @@ class Reading:
     def over(self, other: Reading) -> Reading:
         """`other` with all that differs from the default here."""
         return Reading(replace(other.told, **_said(self.told)), replace(other.part, **_said(self.part)))
+
+
+def told_energy(energy: float | str | None, wavelength: float | None, index: float | None) -> float | str | None:
+    """The photon energy [keV] of the options --energy-kev, --wavelength and --medium-index, of which some are None.
+
+    Errors: `InputError` for an energy beside a wavelength, and for an index without one.
+    """
+    if wavelength is None:
+        require(index is None, "--medium-index needs --wavelength, which is shorter in the medium; give both.")
+        return energy
+    require(energy is None, "--energy-kev and --wavelength say the same; give one of them.")
+    return photon_energy(wavelength, 1.0 if index is None else index)
 
 
 def ends_of(name: str, text: str) -> tuple[float, float]:

@@ -17,7 +17,7 @@ import numpy as np
 from ..checks import InputError, UnsaidError, finite, in_range, require, shaped, warn
 from ..geometry import Views, rotation_y
 from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, checked_distance
-from ..units import ANGLE_UNITS, ENERGY_UNITS, LENGTH_UNITS, PLANCK_TIMES_C_KEV_M, TIME_UNITS
+from ..units import ANGLE_UNITS, BEAM_RANGE_KEV, ENERGY_UNITS, LENGTH_UNITS, PLANCK_TIMES_C_KEV_M, TIME_UNITS
 from .hdf5 import Fields, attribute_text, open_hdf5
 from .light import read_divided_light
 from .nxtomo_geometry import FLIPS as FLIPS
@@ -220,8 +220,8 @@ def _optional(
 def _views(fields: Fields, kinds: np.ndarray, given: Mapping[str, Any]) -> Views:
     shape = fields.dataset(fields.need(*DATA_NAMES)).shape[1:]
     shifts = _optional(fields, kinds, SHIFT, LENGTH_UNITS, "m", (2,))
-    pixel_size = said(given, "pixel_size") or _pixel_sizes(fields, kinds) / _magnification(
-        fields, kinds, PIXEL_SIZES[:2]
+    pixel_size = (said(given, "pixel_size") or _pixel_sizes(fields, kinds)) / _magnification(
+        fields, kinds, given, "pixel_size", PIXEL_SIZES[:2]
     )
     tell_moves(fields, lambda name: _per_frame(fields, kinds, name), float(np.min(pixel_size)))
     if given.get("angles_deg") is not None or not fields.find(ROTATION):
@@ -292,16 +292,19 @@ def _energies(fields: Fields, kinds: np.ndarray, given: Mapping[str, Any]) -> np
     else:
         energies = _per_frame(fields, kinds, name) * fields.unit(name, ENERGY_UNITS, "keV")
     for energy in (energies.min(), energies.max()):
-        in_range(fields.label(name), float(energy), *ENERGY_RANGE_KEV, unit="keV")
+        in_range(
+            fields.label(name), float(energy), *(BEAM_RANGE_KEV if name in WAVELENGTHS else ENERGY_RANGE_KEV), "keV"
+        )
     same = np.allclose(energies, energies[0], rtol=1e-6, atol=0)
     return np.full(len(energies), energies[0]) if same else energies
 
 
 def _distances(fields: Fields, kinds: np.ndarray, given: Mapping[str, Any]) -> np.ndarray:
     told = said(given, "distance")
+    larger = _magnification(fields, kinds, given, "distance", DISTANCES[:1])
     if told is not None:
-        return np.full(int((kinds == PROJECTION).sum()), told)
-    distances = _distances_of_file(fields, kinds) / _magnification(fields, kinds, DISTANCES[:1])
+        return np.full(int((kinds == PROJECTION).sum()), told) / larger
+    distances = _distances_of_file(fields, kinds) / larger
     for distance in (distances.min(), distances.max()):
         checked_distance(float(distance), fields.label(fields.find(*DISTANCES) or ""))
     return distances
@@ -312,12 +315,17 @@ def _distances_of_file(fields: Fields, kinds: np.ndarray) -> np.ndarray:
     return _per_frame(fields, kinds, name) * fields.unit(name, LENGTH_UNITS, "m")
 
 
-def _magnification(fields: Fields, kinds: np.ndarray, effective: tuple[str, ...]) -> np.ndarray | float:
+def _magnification(
+    fields: Fields, kinds: np.ndarray, given: Mapping[str, Any], quantity: str, effective: tuple[str, ...]
+) -> np.ndarray | float:
     """(R + z) / R of a source R before the sample, by which pixels and distance are divided; 1 for a parallel beam, and
-    where the file has one of the `effective` names."""
-    if fields.find(*(name.format(axis) for name in effective for axis in "xy")):
+    where the file has one of the `effective` names, or the quantity is said without the source."""
+    told = said(given, quantity) is not None
+    if told and given.get("source_distance") is None:
         return 1.0
-    return magnification(fields, lambda name: _per_frame(fields, kinds, name), DISTANCES[1])
+    if not told and fields.find(*(name.format(axis) for name in effective for axis in "xy")):
+        return 1.0
+    return magnification(fields, lambda name: _per_frame(fields, kinds, name), DISTANCES[1], given)
 
 
 def _split(fields: Fields, kinds: np.ndarray) -> np.ndarray:

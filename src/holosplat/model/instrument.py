@@ -62,7 +62,8 @@ class Instrument:
         )
         ratio = far_from_edges(exposures.energy_kev, exposures.reference_energy) if dispersion is None else dispersion
         self._factors = _factors(wavenumber(exposures.energy_kev), ratio, self.device)
-        self.path = self._path(None, None, None)
+        one = None if self.views.has_one_pixel else False  # scaled distances are those of Fresnel's kernel alone
+        self.path = self._path(None, None, None, one)
 
     @cached_property
     def poses(self) -> Poses:
@@ -97,7 +98,7 @@ class Instrument:
         if distance is None and psf_sigma_px is None:
             path = self.path if chosen is None else self.path[chosen]
         else:
-            path = self._path(chosen, distance, psf_sigma_px)
+            path = self._path(chosen, distance, psf_sigma_px, self.path.beyond is not None)
         refraction = self.refraction(lines.materials, chosen)
         return hologram(lines.channels.to(self.device, self.dtype), refraction, path, self.backend)
 
@@ -113,8 +114,11 @@ class Instrument:
         pairs = [factors[:, c].unbind(1) for c in channels]
         return torch.stack([torch.stack((f * d, g * b), dim=1) for (f, g), (d, b) in zip(pairs, materials)], dim=1)
 
-    def _path(self, index: Tensor | None, distance: Tensor | None, psf_sigma_px: Tensor | None) -> OpticalPath:
-        """The path of the views `index` at other distances, or through other point-spread functions."""
+    def _path(
+        self, index: Tensor | None, distance: Tensor | None, psf_sigma_px: Tensor | None, exact: bool | None
+    ) -> OpticalPath:
+        """The path of the views `index` at other distances, or through other point-spread functions; exact: as of
+        `optical_path`."""
         taken = self._optical if index is None else self._optical[index.cpu().numpy()]
         my, mx = (m * self.oversample for m in self.margin)
         sigma = taken.psf_sigma_px if psf_sigma_px is None else psf_sigma_px
@@ -126,6 +130,7 @@ class Instrument:
             sigma * self.oversample,
             (taken.views.shape, (my, mx), self.oversample),
             self.dtype,
+            exact=exact,
         ).to(self.device)
 
     def image(self, B: Tensor, D: Tensor, index: np.ndarray | None = None) -> Tensor:

@@ -10,6 +10,9 @@ from torch import Tensor
 
 from ..units import wavelength, wavenumber
 
+ANYWHERE = 1_000_000
+"""Pixels that no frame has."""
+
 
 def exit_wave_minus_one(B: Tensor, D: Tensor, energy_kev: float) -> Tensor:
     """`U - 1` behind the object, complex [..., H, W], with `U = exp(-k B - i k D)` (B, D in metres).
@@ -64,11 +67,72 @@ def fresnel_factors(
     return factors[0], factors[1]
 
 
+def beyond_paraxial(f2: Tensor, wavelengths: Tensor, distances: Tensor) -> Tensor:
+    """Phase [V, ...] that the Fresnel kernel `exp(-iπλz f²)` leaves out at squared frequencies f2 [...] [1/m²].
+
+    The angular spectrum `exp(iz(√(k² - kx² - ky²) - k))` (Goodman 2005, eq. 3-74) is the Fresnel kernel times
+    `exp(-i phase)`. With s = λ²f² it is `k z s² / 2(1 + √(1 - s))²`, about `πλ³z f⁴/4`, free of cancellation; for waves
+    that fade (s > 1) that at s = 1. wavelengths, distances: [V] [m], float64, whose gradients pass on.
+    """
+    lam, z = (given.reshape(-1, *(1,) * f2.ndim) for given in (wavelengths, distances))
+    s = (lam**2 * f2).clamp_max(1.0)
+    return math.pi * z / lam * (s / (1 + torch.sqrt(1 - s))) ** 2
+
+
+def needs_angular_spectrum(
+    raster: tuple[int, int], pitch: float, wavelengths: np.ndarray, distances: np.ndarray
+) -> bool:
+    """Whether the Fresnel kernel is wrong by more than the rounding of the float32 transforms around it.
+
+    The error is `beyond_paraxial` at the highest frequency that both axes of the raster of samples of `pitch` [m] keep
+    (`fresnel_factors`). Rounding of a transform of N samples is about ε log₂ N (Gentleman & Sande 1966, AFIPS 29, 563).
+    """
+    lam, z = np.broadcast_arrays(np.atleast_1d(wavelengths), np.atleast_1d(np.abs(distances)))
+    seen = [np.minimum(0.5 / pitch, 0.5 * n * pitch / np.maximum(lam * z, 1e-300)) for n in raster]
+    s = np.minimum(lam**2 * (seen[0] ** 2 + seen[1] ** 2), 1.0)
+    phase = np.pi * z / lam * (s / (1 + np.sqrt(1 - s))) ** 2
+    return bool(phase.max() > np.finfo(np.float32).eps * math.log2(math.prod(raster)))
+
+
+def transfer_phase(
+    f2: Tensor, raster: tuple[int, int], pitch: float, distance: np.ndarray, energy_kev: np.ndarray
+) -> Tensor:
+    """`χ` [V, ...] by which free space turns waves of squared frequencies f2 [...] [1/m²] back, float64: πλz f², and
+    what `beyond_paraxial` adds where `needs_angular_spectrum`."""
+    lam = wavelength(energy_kev)
+    chi = math.pi * torch.from_numpy(lam * distance).reshape(-1, *(1,) * f2.ndim) * f2
+    if not needs_angular_spectrum(raster, pitch, lam, distance):
+        return chi
+    return chi + beyond_paraxial(f2, torch.from_numpy(lam), torch.from_numpy(distance))
+
+
+def angular_spectrum_factor(
+    raster: tuple[int, int], pitch: float, wavelengths: Tensor, distances: Tensor, dtype: torch.dtype
+) -> Tensor:
+    """What the product of `fresnel_factors` lacks of the angular spectrum, complex [V, H, W] of `dtype`.
+
+    wavelengths, distances: [V] [m], float64, whose gradients pass on. Waves that fade are cut, and those that would
+    travel further than half the raster, which at steep angles is further than `fresnel_factors` says.
+    """
+    fy, fx = (torch.fft.fftfreq(n, pitch, dtype=torch.float64, device=distances.device) for n in raster)
+    f2 = fy[:, None] ** 2 + fx**2
+    lam, z = wavelengths[:, None, None], distances.detach()[:, None, None]
+    cosine = torch.sqrt((1 - lam**2 * f2).clamp_min(1e-300))
+    kept = lam**2 * f2 < 1
+    for f, n in ((fy[:, None], raster[0]), (fx, raster[1])):
+        kept = kept & ((lam * z * f).abs() <= 0.5 * n * pitch * cosine * (1 + 1e-9))
+    return (torch.exp(-1j * beyond_paraxial(f2, wavelengths, distances)) * kept).to(dtype)
+
+
 def fresnel_propagate(wave: Tensor, transfer: Tensor) -> Tensor:
     """`wave` [..., H, W] after free space with `transfer` [..., H, W]; periodic, so pass `U - 1` on a padded raster."""
     return torch.fft.ifft2(torch.fft.fft2(wave) * transfer)
 
 
 def fresnel_reach_px(pitch: float, distance: float, energy_kev: float) -> int:
-    """How far [pixels of `pitch` m] the finest resolved fringe travels sideways: λz/(2p²), rounded up."""
-    return math.ceil(wavelength(energy_kev) * abs(distance) / (2 * pitch**2))
+    """How far [pixels of `pitch` m] the finest resolved fringe travels sideways: z tan θ / p at sin θ = λ/2p, rounded
+    up to a millionth of it; that is λz/(2p²) where angles are small. Where it fades, `ANYWHERE`."""
+    sine = wavelength(energy_kev) / (2 * pitch)
+    if sine >= 1:
+        return ANYWHERE if distance else 0
+    return math.ceil((1 - 1e-6) * abs(distance) * sine / (pitch * math.sqrt(1 - sine**2)))

@@ -6,6 +6,8 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from ..geometry import Grid
 from ..scan import Exposures
@@ -104,17 +106,80 @@ def _is_5_smooth(n: int) -> bool:
     return n == 1
 
 
+class SharedPoses:
+    """Frames of one projection: those of one pose, pixel, time and photon energy at several distances.
+
+    of: [V] int, the projection of each; any: whether there are such frames. Poses are one whose turn to each other
+    moves the edge of the field by less than half a pixel, as of frames that were aligned one by one. Where poses are
+    taken at one distance alone, each frame stays by itself. Shifts may differ: `retrieval.contact` moves frames to each
+    other.
+    """
+
+    def __init__(self, exposures: Exposures) -> None:
+        count = len(exposures)
+        pose = np.arange(count) if np.ptp(exposures.distance) == 0 else self._poses(exposures)
+        frames = np.bincount(pose, minlength=count)
+        self.any = bool((frames > 1).any())
+        _, of = np.unique(pose, return_inverse=True)
+        self.of = of.reshape(-1)
+        self._of, self._count = torch.from_numpy(self.of), torch.from_numpy(np.bincount(self.of))
+
+    @staticmethod
+    def _poses(exposures: Exposures) -> np.ndarray:
+        """The first frame of the pose of each [V]: the nearest pose that has none of its distance yet."""
+        views, turns = exposures.views, exposures.views.rotations
+        optics = np.stack((views.relative, exposures.time, exposures.energy_kev), axis=1)
+        _, kind = np.unique(optics, axis=0, return_inverse=True)
+        kind, pose = kind.reshape(-1), np.arange(len(exposures))
+        least = 2 * (1 - np.cos(1 / max(views.shape)))  # 3 - trace of a turn of half a pixel at the edge
+        for same in (np.flatnonzero(kind == k) for k in np.unique(kind)):
+            firsts: list[int] = []
+            has: list[set[float]] = []
+            for v in same.tolist():
+                far = 3 - np.einsum("nij,ij->n", turns[firsts], turns[v])
+                far[[exposures.distance[v] in distances for distances in has]] = np.inf
+                n = int(far.argmin()) if firsts else 0
+                if firsts and far[n] < least:
+                    pose[v] = firsts[n]
+                    has[n].add(exposures.distance[v])
+                else:
+                    firsts.append(v)
+                    has.append({exposures.distance[v]})
+        return pose
+
+    def sum(self, values: Tensor) -> Tensor:
+        """Values [V, ...], each as the sum over the frames of its projection."""
+        if not self.any:
+            return values
+        of = self._of.to(values.device)
+        return values.new_zeros(len(self._count), *values.shape[1:]).index_add_(0, of, values).index_select(0, of)
+
+    def mean(self, values: Tensor) -> Tensor:
+        """Values [V, ...], each as the mean over the frames of its projection."""
+        if not self.any:
+            return values
+        count = self._count[self._of].reshape(-1, *(1,) * (values.ndim - 1))
+        return self.sum(values) / count.to(values)
+
+
 def alike(exposures: Exposures, oversample: int = 0) -> Iterator[np.ndarray]:
     """Indices of views that share distance, blur and energy, and so a raster, of `MOST_SAMPLES` at most or one by one.
 
+    Frames of one projection (`SharedPoses`) stay together, beside those of others of the same distances.
     oversample: wave samples a pixel (0: as the first fringe needs).
     """
     optical = exposures.optical
     optics = np.stack((optical.distance, optical.psf_sigma_px, optical.energy_kev), axis=1)
-    for one in np.unique(optics, axis=0):
-        views = np.flatnonzero((optics == one).all(axis=1))
-        sample = exposures[views[:1]]
+    _, kind = np.unique(optics, axis=0, return_inverse=True)
+    kind, of = kind.reshape(-1), SharedPoses(exposures).of
+    order = np.lexsort((np.arange(len(of)), of))
+    poses = np.split(order, np.flatnonzero(np.diff(of[order])) + 1)
+    together: dict[tuple[int, ...], list[np.ndarray]] = {}
+    for pose in sorted(poses, key=lambda pose: pose[0]):
+        together.setdefault(tuple(sorted(kind[pose])), []).append(pose)
+    for _, same in sorted(together.items()):
+        sample = exposures[same[0]]
         finer = oversample or fringe_sampling(sample)
         rows, columns = sample.views.padded(padding(sample, finer)).refined(finer).shape
-        at_once = max(1, MOST_SAMPLES // (rows * columns))
-        yield from (views[i : i + at_once] for i in range(0, len(views), at_once))
+        at_once = max(1, MOST_SAMPLES // (rows * columns * len(same[0])))
+        yield from (np.concatenate(same[i : i + at_once]) for i in range(0, len(same), at_once))

@@ -32,7 +32,7 @@ from ..optics.noise import noise_levels, noise_share
 from ..optics.noise_model import NoiseModel
 from ..optics.sampling import fringes
 from ..scan import Exposures, Scan
-from ..units import span
+from ..units import beam_named, span
 from .acts import of_each_time
 from .look import LOOKED, Look, looked
 from .needs import (
@@ -187,11 +187,11 @@ def _frames(scan: Scan, file: ScanFile | None) -> dict[str, str]:
 
 def _beam(exposures: Exposures, unsaid: Unsaid) -> dict[str, str]:
     values = {
-        "energy_kev": f"{span(exposures.energy_kev)} keV",
         "distance": f"{span(exposures.distance)} m",
         "pixel_size": f"{span(1e6 * exposures.views.pixel_sizes)} µm",
     }
-    rows = {NAMES.get(name, name): UNKNOWN if name in unsaid else text for name, text in values.items()}
+    rows = dict([beam_named(exposures.energy_kev)]) if "energy_kev" not in unsaid else {NAMES["energy_kev"]: UNKNOWN}
+    rows |= {NAMES.get(name, name): UNKNOWN if name in unsaid else text for name, text in values.items()}
     if exposures.psf_sigma_px.any():
         rows["blur"] = f"standard deviation {span(exposures.psf_sigma_px)} pixels"
     return rows

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..metrics import VolumeScores
-from ..units import in_percent, plain, wavenumber
+from ..units import beam_named, in_percent, plain, wavenumber
 from ..volume import Volume
 from ..workflows.verdict import Verdict
 from .content import UNSURE, GuessShown, ReportContent
@@ -188,7 +188,7 @@ def _projections(content: ReportContent) -> Block:
     figure = projections_figure(maps, content.energy_kev, content.pixel_size, told)
     k, name = wavenumber(content.energy_kev), "phase" if told else "absorption"
     text = "Phase φ = −kD with D = ∫δ dz, and absorption 2kB with B = ∫β dz" if told else "Absorption 2k∫β dz = ∫µ dz"
-    text += f", at {content.energy_kev:g} keV, {' and '.join(maps.labels[:2])}. "
+    text += f", at {beam_named(content.energy_kev)[1]}, {' and '.join(maps.labels[:2])}. "
     values = -k * np.asarray(maps.projected_delta[:2]) if told else 2 * k * np.asarray(maps.projected_beta[:2])
     low, high = (scientific(end) for end in _ends(values))
     text += f"The reconstruction's {name} runs from {low} to {high}{' rad' * told}. "

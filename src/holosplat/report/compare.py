@@ -19,7 +19,7 @@ from ..methods import METHODS
 from ..metrics import VolumeScores, volume_scores
 from ..scan import Scan
 from ..tables import to_table
-from ..units import in_percent, wavenumber
+from ..units import beam_named, in_percent, wavenumber
 from ..volume import Volume
 from ..workflows.evaluate import Evaluation, evaluate, of_absorption
 from ..workflows.provenance import CONFIG_SUM, RUN
@@ -137,7 +137,7 @@ class Comparison:
         rows = self._rows(
             ("folder", lambda side: str(side.folder.path)),
             ("object", lambda side: f"{side.result.method}: {side.result.object.described}"),
-            ("photon energy", lambda side: f"{side.result.energy_kev:g} keV"),
+            ("photon energy or wavelength", lambda side: beam_named(side.result.energy_kev)[1]),
             ("verdict", lambda side: in_print(side.result.verdict.words) if side.result.verdict else "not judged"),
             ("likely cause", _cause),
             ("total", lambda side: in_print(side.result.total.words) if side.result.total else "–"),

@@ -12,7 +12,7 @@ from ..io.formats import loader_of
 from ..io.json import read_json
 from ..io.reading import Reading
 from ..memory import uncollected
-from ..units import in_percent
+from ..units import beam_named, in_percent
 from ..workflows.choice import Choice
 from ..workflows.run_folder import RunFolder
 
@@ -112,7 +112,7 @@ def _result(summary: dict) -> dict[str, str]:
     rows["method"] = f"{summary.get('method', 'gaussians')}; object: {summary.get('size', summary.get('kind', ''))}"
     if detector:
         size = f"{detector['rows']} × {detector['columns']} pixels of {1e6 * detector['pixel_size_m']:.4g} µm"
-        rows["frames"] = f"{size} at {summary.get('energy_kev', 0):g} keV"
+        rows["frames"] = f"{size} at {beam_named(summary['energy_kev'])[1]}" if "energy_kev" in summary else size
     rows["verdict"] = verdict.get("words", "none was made")
     rows |= {f"verdict {n}": text for n, text in enumerate(verdict.get("reasons", ()), 1)}
     judged = Choice.read(summary).judged

@@ -10,11 +10,14 @@ import jinja2
 import numpy as np
 
 from ..io.atomic import atomic_path
-from ..units import in_percent
+from ..units import XRAYS_KEV, beam_named, in_percent
 from ..workflows.next_step import Step, next_step
 from .blocks import make_blocks
 from .content import Moving, ReportContent, flatten
 from .style import format_length, in_print, scientific
+
+LIGHT_DELTA = "1 − n/n of the medium: below 0 where the refractive index is the larger one"
+"""What δ is of light."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +137,8 @@ def record_tables(content: ReportContent) -> list[Table]:
     """Records that make the run repeatable: input, settings, versions, machine and timing."""
     shape, edges = content.reconstruction.grid.shape[::-1], content.reconstruction.grid.voxel_size
     data = [
-        ("photon energy", f"{content.energy_kev:g} keV"),
+        beam_named(content.energy_kev),
+        *([("δ", LIGHT_DELTA)] if content.energy_kev < XRAYS_KEV[0] else []),
         ("pixel size", format_length(content.pixel_size, 4)),
         ("voxels (x × y × z)", " × ".join(str(n) for n in shape)),
         (

@@ -24,7 +24,7 @@ from ..projectors.voxels import voxel_line_integrals
 from ..representations import MovingSurfaces, Stored
 from ..scan import Scan
 from ..tables import to_table
-from ..units import span, wavenumber
+from ..units import beam_named, span, wavenumber
 from ..volume import Volume
 from ..workflows.evaluate import Evaluation, of_absorption, render
 from ..workflows.forecast import NUMBERS, flow_in_words, read_band
@@ -185,14 +185,12 @@ def _summary(reconstruction: Reconstruction, scan: Scan, moving: Moving | None) 
     exposures, views = scan.exposures, scan.views
     h, w = views.shape
     distance = f"{span(100 * exposures.distance)} cm behind the sample" if exposures.distance.any() else "in contact"
-    energies = exposures.energy_kev.min(), exposures.energy_kev.max()
-    energy = f"{energies[0]:g}" if exposures.has_one_energy else f"{energies[0]:g} to {energies[1]:g}"
     state = "" if reconstruction.finished else " The fit was interrupted before its end."
     if moving is not None:
         state += f" Volumes, slices and projections are those at {1e6 * _middle(moving):.4g} µs."
     return (
         f"{len(scan.train())} training and {len(scan.test())} held-out frames of {h} × {w} pixels of "
-        f"{span(1e6 * views.pixel_sizes)} µm, {energy} keV, {distance}; "
+        f"{span(1e6 * views.pixel_sizes)} µm, {beam_named(exposures.energy_kev)[1]}, {distance}; "
         f"{reconstruction.object.described}.{state}"
     )
 

@@ -31,6 +31,7 @@ from ..optics.background import LightOptions
 from ..representations import InMotion, MovingSurfaces, Stored
 from ..scan import Scan
 from ..tables import to_table
+from ..units import beam_named, wavelength
 from .choice import Choice
 from .provenance import scan_hash
 from .run_folder import RunFolder
@@ -60,6 +61,7 @@ def summary_of(done: Reconstruction, fit: Running | None, train: Scan) -> dict[s
             "centre_m": Grid.of_views(train.views).centre.tolist(),
         },
         "energy_kev": done.energy_kev,
+        "wavelength_m": wavelength(done.energy_kev),
         "material": {
             "delta": matter.delta,
             "beta": matter.beta,
@@ -161,7 +163,8 @@ class Reconstruction:
 
     def _repr_html_(self) -> str:
         """What Jupyter shows: what was decided and found, and the object."""
-        rows = {"method": self.method, "photon energy": f"{self.energy_kev:.4g} keV", "finished": str(self.finished)}
+        rows = {"method": self.method, "finished": str(self.finished)}
+        rows |= dict([beam_named(self.energy_kev)])
         rows["time"] = f"{sum(self.timing.values()):.1f} s"
         rows |= {"frames": " ".join(self.verdict.lines("training frames"))} if self.verdict else {}
         rows |= {"total": self.total.words} if self.total else {}

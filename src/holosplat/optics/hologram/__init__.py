@@ -19,7 +19,7 @@ from ...backends import implementation
 from ...checks import require
 from ...units import wavelength
 from ..detector import gaussian_factors
-from ..propagation import fresnel_factors
+from ..propagation import angular_spectrum_factor, fresnel_factors, needs_angular_spectrum
 
 Refraction = Sequence[tuple[float, float]] | np.ndarray | Tensor
 """`(k δ, k β)` of each channel of matter per unit of its line integral: [C, 2] for all views, or [V, C, 2]."""
@@ -38,6 +38,9 @@ class OpticalPath:
     margin: samples (y, x) between the raster's border and the frame's.
     factor: samples along a pixel's edge.
     pitch: of the samples [m].
+    beyond [U, H, W]: what the product of rows and columns lacks of the angular spectrum, of each of U pairs of
+        wavelength and distance; which [V]: the pair of each view. Both None where Fresnel's kernel is exact to
+        rounding (`propagation.needs_angular_spectrum`), which costs nothing.
 
     The factors may come from distances and widths that want gradients (`optical_path`, `corrected`).
     """
@@ -52,6 +55,8 @@ class OpticalPath:
     margin: tuple[int, int]
     factor: int
     pitch: float
+    beyond: Tensor | None = None
+    which: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -59,11 +64,12 @@ class OpticalPath:
     def __getitem__(self, index: Tensor) -> OpticalPath:
         """The path of the views `index` [K], an integer tensor on the path's device."""
         picked = [None if a is None else a.index_select(0, index) for a in self._arrays]
-        return self._of(picked)
+        return self._of(picked, self.beyond, None if self.which is None else self.which.index_select(0, index))
 
     def to(self, device: torch.device | str) -> OpticalPath:
         """The same path with its factors on `device`."""
-        return self._of([None if a is None else a.to(device) for a in self._arrays])
+        moved = [None if a is None else a.to(device) for a in (*self._arrays, self.beyond, self.which)]
+        return self._of(moved[:5], *moved[5:])
 
     def corrected(self, distance: Tensor | None = None, psf_sigma: Tensor | None = None) -> OpticalPath:
         """The same path at other distances [V] [m] and with other widths [V] of the point-spread function [samples].
@@ -83,6 +89,9 @@ class OpticalPath:
         if distance is not None:
             rows, columns = fresnel_factors(self.raster, self.pitch, self.wavelength * distance, self.rows.dtype)
             path = replace(path, rows=rows, columns=columns)
+            if self.beyond is not None:
+                full = angular_spectrum_factor(self.raster, self.pitch, self.wavelength, distance, self.rows.dtype)
+                path = replace(path, beyond=full, which=torch.arange(len(self), device=full.device))
         if psf_sigma is not None:
             rows, columns = gaussian_factors(self.raster, psf_sigma, self.rows.dtype.to_real())
             path = replace(path, blur_rows=rows, blur_columns=columns, alike=False)
@@ -94,11 +103,31 @@ class OpticalPath:
         return self.rows.shape[1], self.columns.shape[1]
 
     @property
+    def correction(self) -> Tensor | None:
+        """`beyond` of each view [V, H, W], a view of it where all have the same."""
+        if self.beyond is None or self.which is None:
+            return None
+        if len(self.beyond) == 1:
+            return self.beyond.expand(len(self), -1, -1)
+        return self.beyond.index_select(0, self.which)
+
+    @property
+    def transfer(self) -> Tensor:
+        """The transfer functions [V, H, W]."""
+        return self.factors if self.correction is None else self.factors * self.correction
+
+    @property
+    def factors(self) -> Tensor:
+        """The product of rows and columns [V, H, W]."""
+        return self.rows[:, :, None] * self.columns[:, None]
+
+    @property
     def _arrays(self) -> tuple[Tensor | None, ...]:
         return self.rows, self.columns, self.blur_rows, self.blur_columns, self.wavelength
 
-    def _of(self, arrays: list[Tensor | None]) -> OpticalPath:
-        return OpticalPath(*arrays, self.alike, self.shape, self.margin, self.factor, self.pitch)  # type: ignore[arg-type]
+    def _of(self, arrays: list[Tensor | None], beyond: Tensor | None, which: Tensor | None) -> OpticalPath:
+        rest = (self.alike, self.shape, self.margin, self.factor, self.pitch)
+        return OpticalPath(*arrays, *rest, beyond, which)  # type: ignore[arg-type]
 
 
 def optical_path(
@@ -109,12 +138,15 @@ def optical_path(
     psf_sigma: np.ndarray | Tensor,
     frame: tuple[tuple[int, int], tuple[int, int], int],
     dtype: torch.dtype = torch.float32,
+    *,
+    exact: bool | None = None,
 ) -> OpticalPath:
     """The path of V exposures: distance [V] in metres, psf_sigma [V] in samples of `pitch` [m], on `raster` [H, W].
 
     energy_kev: photon energy [keV], one or [V]; frame: (rows, columns) of the frame, its margin (y, x) in samples, and
     the samples along a pixel's edge. Distances and widths that are tensors (float64, on the device of the path) pass
     gradients on, as `OpticalPath.corrected` says. Widths in an array that are all zero make a path without blur.
+    exact: whether waves go by the angular spectrum (default: where `propagation.needs_angular_spectrum` says so).
     """
     tensors = [x for x in (distance, psf_sigma) if isinstance(x, Tensor)]
     on = tensors[0].device if tensors else torch.device("cpu")
@@ -129,7 +161,16 @@ def optical_path(
     sigma, fixed = _numbers(psf_sigma, on), not isinstance(psf_sigma, Tensor)
     blurs = (None, None) if fixed and not bool((sigma > 0).any()) else gaussian_factors(raster, sigma, dtype)
     alike = fixed and bool((sigma == sigma[:1]).all())
-    return OpticalPath(rows, columns, *blurs, lam, alike, *frame, pitch)
+    if exact is None:
+        exact = needs_angular_spectrum(raster, pitch, lam.cpu().numpy(), z.detach().cpu().numpy())
+    beyond = which = None
+    if exact:
+        pairs, which = torch.stack((lam, z.detach()), dim=1), torch.arange(len(z), device=on)
+        if not isinstance(distance, Tensor):
+            pairs, which = torch.unique(pairs, dim=0, return_inverse=True)
+        way = z if isinstance(distance, Tensor) else pairs[:, 1]
+        beyond = angular_spectrum_factor(raster, pitch, pairs[:, 0], way, complex_dtype)
+    return OpticalPath(rows, columns, *blurs, lam, alike, *frame, pitch, beyond, which)
 
 
 def _numbers(given: np.ndarray | Tensor, on: torch.device) -> Tensor:

@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from ... import native
-from .factors import factor_gradients
+from .factors import factor_gradients, through_correction
 
 if TYPE_CHECKING:
     from . import OpticalPath
@@ -30,15 +30,15 @@ if TYPE_CHECKING:
 def hologram(lines: Tensor, refraction: np.ndarray | Tensor, path: OpticalPath) -> Tensor:
     """Frames [V, h, w]; arguments as the package's `hologram`, already checked."""
     table = torch.as_tensor(refraction).expand(len(path), -1, -1).contiguous()
-    factors = (path.rows, path.columns, path.blur_rows, path.blur_columns)
+    factors = (path.rows, path.columns, path.correction, path.blur_rows, path.blur_columns)
     return _Hologram.apply(lines, table, path, *factors)  # type: ignore[no-any-return]
 
 
 class _Hologram(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, lines: Tensor, table: Tensor, path: OpticalPath, *_: Tensor | None) -> Tensor:  # type: ignore[override]
-        lines = lines.contiguous()
-        wave = _filter(_exit_wave(lines, table), path.rows, path.columns)
+    def forward(ctx: Any, lines: Tensor, table: Tensor, path: OpticalPath, *factors: Tensor | None) -> Tensor:  # type: ignore[override]
+        lines, correction = lines.contiguous(), factors[2]
+        wave = _inverse(_transfer(_forward(_exit_wave(lines, table)), path.rows, path.columns, correction))
         frames = torch.empty(len(lines), *path.shape)
         if path.blur_rows is None:
             _call("intensity", _detector(path), wave, frames)
@@ -46,7 +46,7 @@ class _Hologram(torch.autograd.Function):
             images = _filter(_contrast(wave, path), *_blur(path))
             _call("bin", _detector(path), images, frames)
         ctx.save_for_backward(lines)
-        ctx.table, ctx.path, ctx.wave = table, path, wave
+        ctx.table, ctx.path, ctx.wave, ctx.correction = table, path, wave, correction
         return frames
 
     @staticmethod
@@ -57,24 +57,25 @@ class _Hologram(torch.autograd.Function):
             raise RuntimeError("the hologram's gradient can be taken once only; compute the frames anew.")
         ctx.wave = None
         of_lines, of_path, of_blur = _asked(ctx.needs_input_grad)
-        path_gradients: tuple[Tensor | None, Tensor | None] = (None, None)
+        way: tuple[Tensor | None, ...] = (None, None, None)
         wave, blur_gradients = _detected_backward(gradient, wave, path, of_blur)
         spectrum = _forward(wave)
         if of_path:
             passed = _forward(_exit_wave(lines, ctx.table))
-            path_gradients = factor_gradients(spectrum, passed, path.rows, path.columns)
+            passed, of_correction = through_correction(spectrum, passed, path.factors, ctx.correction)
+            way = (*factor_gradients(spectrum, passed, path.rows, path.columns), of_correction)
         if not of_lines:
-            return None, None, None, *path_gradients, *blur_gradients
-        wave = _inverse(_transfer(spectrum, path.rows, path.columns, conjugate=True))
+            return None, None, None, *way, *blur_gradients
+        wave = _inverse(_transfer(spectrum, path.rows, path.columns, ctx.correction, conjugate=True))
         del spectrum  # a wave's worth of memory, before the next array is made
         out = torch.empty_like(lines)
         _call("exit_wave_backward", _raster(lines), ctx.table, lines, wave, out)
-        return out, None, None, *path_gradients, *blur_gradients
+        return out, None, None, *way, *blur_gradients
 
 
 def _asked(needs: tuple[bool, ...]) -> tuple[bool, bool, bool]:
     """Whether gradients of the line integrals, of the transfer functions, of the point-spread functions are wanted."""
-    return needs[0], any(needs[3:5]), any(needs[5:])
+    return needs[0], any(needs[3:6]), any(needs[6:])
 
 
 def _detected_backward(
@@ -113,14 +114,17 @@ def _filter(wave: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
     return _inverse(_transfer(_forward(wave), rows, columns))
 
 
-def _transfer(spectrum: Tensor, rows: Tensor, columns: Tensor, conjugate: bool = False) -> Tensor:
-    """`spectrum` [K, H, W] times rows [K, H] and columns [K, W] (or their conjugates) over H·W, in place."""
+def _transfer(
+    spectrum: Tensor, rows: Tensor, columns: Tensor, correction: Tensor | None = None, conjugate: bool = False
+) -> Tensor:
+    """`spectrum` [K, H, W] times rows [K, H], columns [K, W] and correction [K, H, W] (or their conjugates) over H·W,
+    in place."""
     count, height, width = spectrum.shape
     raster, scale = native.Raster(count, 1, height, width), 1 / (height * width)
     factors = (c_void_p(rows.data_ptr()), c_void_p(columns.data_ptr()))
     threads = torch.get_num_threads()
     native.call("holosplat_transfer", raster, *factors, scale, int(conjugate), c_void_p(spectrum.data_ptr()), threads)
-    return spectrum
+    return spectrum if correction is None else spectrum.mul_(correction.conj() if conjugate else correction)
 
 
 def _forward(wave: Tensor) -> Tensor:

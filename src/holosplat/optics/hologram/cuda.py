@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 
 from ...launch import launching
 from . import triton_waves
-from .factors import factor_gradients
+from .factors import factor_gradients, through_correction
 
 if TYPE_CHECKING:
     from . import OpticalPath
@@ -25,26 +25,26 @@ if TYPE_CHECKING:
 def hologram(lines: Tensor, refraction: np.ndarray | Tensor, path: OpticalPath) -> Tensor:
     """Frames [V, h, w]; arguments as the package's `hologram`, already checked."""
     matter = refraction.float() if isinstance(refraction, Tensor) else refraction.tolist()
-    factors = (path.rows, path.columns, path.blur_rows, path.blur_columns)
+    factors = (path.rows, path.columns, path.correction, path.blur_rows, path.blur_columns)
     return _Hologram.apply(lines, matter, path, *factors)  # type: ignore[no-any-return]
 
 
 class _Hologram(torch.autograd.Function):
     @staticmethod
     def forward(  # type: ignore[override]
-        ctx: Any, lines: Tensor, matter: triton_waves.Refraction, path: OpticalPath, *_: Tensor | None
+        ctx: Any, lines: Tensor, matter: triton_waves.Refraction, path: OpticalPath, *factors: Tensor | None
     ) -> Tensor:
-        lines, crop = lines.contiguous(), (path.margin, path.factor)
+        lines, correction, crop = lines.contiguous(), factors[2], (path.margin, path.factor)
         with launching(lines):
             wave = triton_waves.exit_wave(lines, matter)
-            wave = _inverse(_transfer(_forward(wave), path))
+            wave = _inverse(_transfer(_forward(wave), path, correction))
             if path.blur_rows is None:
                 frames = triton_waves.intensity(wave, path.shape, *crop)
             else:
                 samples = _blurred(_real_spectrum(triton_waves.contrast(wave)), path)
                 frames = triton_waves.bin_samples(samples, path.shape, *crop)
         ctx.save_for_backward(lines)
-        ctx.matter, ctx.path, ctx.wave = matter, path, wave
+        ctx.matter, ctx.path, ctx.wave, ctx.correction = matter, path, wave, correction
         return frames
 
     @staticmethod
@@ -54,18 +54,19 @@ class _Hologram(torch.autograd.Function):
         if wave is None:
             raise RuntimeError("the hologram's gradient can be taken once only; compute the frames anew.")
         ctx.wave, needs = None, ctx.needs_input_grad
-        path_gradients: tuple[Tensor | None, Tensor | None] = (None, None)
+        way: tuple[Tensor | None, ...] = (None, None, None)
         with launching(lines):
-            blur_gradients = _detected_backward(gradient, wave, path, any(needs[5:]))
+            blur_gradients = _detected_backward(gradient, wave, path, any(needs[6:]))
             spectrum = _forward(wave)
-            if any(needs[3:5]):
+            if any(needs[3:6]):
                 passed = _forward(triton_waves.exit_wave(lines, ctx.matter))
-                path_gradients = factor_gradients(spectrum, passed, path.rows, path.columns)
+                passed, of_correction = through_correction(spectrum, passed, path.factors, ctx.correction)
+                way = (*factor_gradients(spectrum, passed, path.rows, path.columns), of_correction)
             if not needs[0]:
-                return None, None, None, *path_gradients, *blur_gradients
-            wave = _inverse(_transfer(spectrum, path, conjugate=True))
+                return None, None, None, *way, *blur_gradients
+            wave = _inverse(_transfer(spectrum, path, ctx.correction, conjugate=True))
             out = triton_waves.exit_wave_backward(lines, ctx.matter, wave)
-        return out, None, None, *path_gradients, *blur_gradients
+        return out, None, None, *way, *blur_gradients
 
 
 def _detected_backward(
@@ -90,10 +91,10 @@ def _forward(wave: Tensor) -> Tensor:
     return torch.fft.fft2(wave).contiguous()
 
 
-def _transfer(spectrum: Tensor, path: OpticalPath, conjugate: bool = False) -> Tensor:
+def _transfer(spectrum: Tensor, path: OpticalPath, correction: Tensor | None, conjugate: bool = False) -> Tensor:
     """`spectrum` [V, H, W] times the path's transfer functions (or their conjugates) over H·W, in place."""
     triton_waves.transfer(spectrum, path.rows.contiguous(), path.columns.contiguous(), conjugate)
-    return spectrum
+    return spectrum if correction is None else spectrum.mul_(correction.conj() if conjugate else correction)
 
 
 def _inverse(spectrum: Tensor) -> Tensor:

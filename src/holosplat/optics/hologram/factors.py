@@ -23,3 +23,15 @@ def factor_gradients(arrived: Tensor, passed: Tensor, rows: Tensor, columns: Ten
     if rows.is_complex():
         return of_rows, of_columns
     return of_rows.real, of_columns.real
+
+
+def through_correction(
+    arrived: Tensor, passed: Tensor, factors: Tensor, correction: Tensor | None
+) -> tuple[Tensor, Tensor | None]:
+    """Of a filter by factors and a correction h, both [V, H, W]: the spectrum `passed h`, with which the gradients of
+    the factors are those of a filter without one, and the gradient of h. Without one the spectrum as it is, and None.
+    """
+    if correction is None:
+        return passed, None
+    count = passed.shape[1] * passed.shape[2]
+    return passed * correction, arrived * (passed * factors).conj() / count

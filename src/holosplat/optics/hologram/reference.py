@@ -1,7 +1,8 @@
 """The wave optics in plain torch: the specification of the fast twins, in any float type, on any device.
 
-The wave behind the object `exp(-Σ (kβ + i kδ) T)` (Paganin 2006, eq. 2.39), less one, is propagated by the product of
-its transfer function's factors (Goodman 2005, eq. 4-20); its intensity is blurred and averaged over pixels.
+The wave behind the object `exp(-Σ (kβ + i kδ) T)` (Paganin 2006, eq. 2.39), less one, is propagated by its
+transfer function (Goodman 2005, eq. 4-20, or 3-74 where that is not enough); its intensity is blurred and averaged
+over pixels.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ def hologram(lines: Tensor, refraction: np.ndarray | Tensor, path: OpticalPath) 
     loss = sum(k_beta * line for (_, k_beta), line in zip(pairs, lines.unbind(1)))
     assert isinstance(phase, Tensor)
     assert isinstance(loss, Tensor)
-    wave = fresnel_propagate(exit_wave_of(loss, phase), path.rows[:, :, None] * path.columns[:, None])
+    wave = fresnel_propagate(exit_wave_of(loss, phase), path.transfer)
     contrast = 2 * wave.real + wave.real**2 + wave.imag**2
     if path.blur_rows is not None and path.blur_columns is not None:
         half = path.blur_columns[:, None, : contrast.shape[-1] // 2 + 1]

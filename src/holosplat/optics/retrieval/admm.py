@@ -110,7 +110,8 @@ def _weights(model: WaveModel, options: ADMM) -> tuple[Tensor, Tensor]:
     """
     slope = gradient(model.phase).square().sum(dim=0).sqrt().double().sum(dim=(1, 2))
     mean = (slope / model.support.double().sum(dim=(1, 2)).clamp_min(1)).cpu().clamp_min(1e-9)
-    weight = options.weight * 0.25 * model.spectra.unexplained.mean(dim=(1, 2)) / mean / model.oversample**2
+    unexplained = model.spectra.poses.mean(model.spectra.unexplained.mean(dim=(1, 2)))
+    weight = options.weight * 0.25 * unexplained / mean / model.oversample**2
     return weight.clamp_min(1e-12)[:, None, None], (EDGE * mean)[:, None, None]
 
 

@@ -15,7 +15,7 @@ from torch.nn.functional import max_pool2d
 
 from ...scan import Exposures
 from ..noise import wavelet_noise, with_gaps
-from .spectra import Gaps, Noise, Prior, Raster, completed, filtered, response, spectra, surrounded
+from .spectra import TINY, Gaps, Noise, Prior, Raster, Spectra, filtered, response, spectra, surrounded
 
 STEPS = 25
 """Alternations between the frame and the bound. Where noise hides the lowest frequencies they go on to drift."""
@@ -63,6 +63,7 @@ def bounded_estimate(
     `SIGNIFICANT` deviations of its noise and zero elsewhere, for noise with its negative half cut off would pass for
     matter (a support found anew in every round: the "shrinkwrap" of Marchesini et al. 2003).
 
+    Frames of one pose at several distances (`SharedPoses`) have one estimate, by all of them.
     missing: pixels [V, H, W] bool without a value (`completed`). two_sided: whether phases may be negative.
     leaves: whether matter goes on above and below the frame, and at its sides. Air there would take a soft body away
     far into the frame, for only the bends of its shadow are seen; it may then go on, and ends as smoothly as it can.
@@ -72,13 +73,14 @@ def bounded_estimate(
     raster = Raster((contrast.shape[-2], contrast.shape[-1]), exposures.views.pixel_size)
     h, prior = response(exposures, ratio, raster), prior or (FIXED if any(leaves) else None)
     known = spectra(frames, exposures, h, raster, noise, MODEL_ERROR, prior, leaks=prior is None, missing=missing)
-    trusted = 1 - known.inverse * known.response
+    trusted = 1 - known.poses.sum(known.inverse * known.response)
     if noise is None:
-        doubtful = wavelet_noise(with_gaps(frames, missing)) * known.inverse.square().mean(dim=(1, 2)).sqrt()
+        gain = known.inverse.square().mean(dim=(1, 2))
+        doubtful = known.poses.sum(wavelet_noise(with_gaps(frames, missing)).square() * gain).sqrt()
     else:
         doubtful = known.noise_of(known.inverse)
     least = (SIGNIFICANT * doubtful)[:, None, None]
-    linear = -sign * filtered(completed(contrast, missing, crop, known), known.inverse)
+    linear = -sign * known.poses.sum(filtered(completed(contrast, missing, crop, known), known.inverse))
     inside = torch.zeros_like(linear[:1])
     inside[:, *(slice(None) if on else part for on, part in zip(leaves, crop[1:]))] = 1
     phase = linear
@@ -92,3 +94,37 @@ def bounded_estimate(
     matter = matter_of(phase)[crop]
     grown = max_pool2d((matter != 0).double()[None], 3, 1, 1)[0] > 0  # thin rims lie below the threshold
     return Estimate(matter, grown)
+
+
+FILLINGS = 50
+"""Steps of conjugate gradients in which missing pixels take what the others say of them."""
+
+
+def completed(contrast: Tensor, missing: Gaps, crop: tuple[slice, slice, slice], known: Spectra) -> Tensor:
+    """The contrast [V, H, W] with missing pixels as the likeliest phase of the others predicts them.
+
+    missing: of the frame, which `crop` takes out of the contrast. With K = H W, the response after Wiener's inverse,
+    the values x in the gaps solve `x = P K (c + x)`, P being their projection: expectation and maximisation in one
+    (Dempster et al. 1977). So the pixels have no weight.
+    """
+    if missing is None or not missing.any():
+        return contrast
+    gain, gaps = known.own_inverse * known.response, torch.zeros_like(contrast)
+    gaps[crop] = missing.to(gaps)
+
+    def explained(images: Tensor) -> Tensor:
+        return gaps * filtered(images, gain)
+
+    def squared(images: Tensor) -> Tensor:
+        return images.square().sum(dim=(1, 2), keepdim=True)
+
+    c = contrast * (1 - gaps)
+    x, left = torch.zeros_like(c), explained(c)
+    way, size = left, squared(left)
+    for _ in range(FILLINGS):
+        slope = way - explained(way)
+        length = size / (way * slope).sum(dim=(1, 2), keepdim=True).clamp_min(TINY)
+        x, left = x + length * way, left - length * slope
+        size, before = squared(left), size
+        way = left + size / before.clamp_min(TINY) * way
+    return c + x

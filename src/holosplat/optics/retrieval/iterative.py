@@ -118,17 +118,17 @@ def through_detector(model: WaveModel, phase: Tensor) -> Tensor:
     Beyond the frame nothing was measured, and the amplitude stays. With `U'` the new wave behind the object and U the
     old one, `-ln(U'/U) = dℓ + i dφ` has no branch to choose as long as an iteration changes the phase by less
     than π: a phase of many radians never wraps. The phase of one material nearest to it, in the logarithm, is
-    `φ + (dφ + r dℓ) / (1 + r²)`, `r = β/δ`.
+    `φ + (dφ + r dℓ) / (1 + r²)`, `r = β/δ`. Frames of one pose give the mean of their changes.
     """
     path, r, sign = model.path, model.ratio, model.sign
-    transfer = path.rows[:, :, None] * path.columns[:, None]
+    transfer = path.transfer
     before = exit_wave_of(sign * r * phase, sign * phase)
     detector = 1 + torch.fft.ifft2(torch.fft.fft2(before) * transfer)
     gain = _gain(model, phase)
     after = before + torch.fft.ifft2(torch.fft.fft2((gain - 1) * detector) * transfer.conj())
     change = (1 + after) / (1 + before)
     loss, delay = -torch.log(change.abs().clamp_min(DARKEST)), -torch.angle(change)
-    return phase + sign * (delay + r * loss) / (1 + r**2)
+    return phase + sign * model.spectra.poses.mean((delay + r * loss) / (1 + r**2))
 
 
 def _gain(model: WaveModel, phase: Tensor) -> Tensor:

@@ -15,6 +15,7 @@ from ...progress import Advance
 from ...ranges import ranged
 from ...scan import Exposures
 from ...units import wavelength, wavenumber
+from .bounded import completed
 from .contact import or_in_contact
 from .spectra import (
     Noise,
@@ -24,7 +25,6 @@ from .spectra import (
     check_noise,
     checked,
     column,
-    completed,
     detector_transfer,
     filtered,
     fresnel_phase,
@@ -93,7 +93,7 @@ def paganin(
     h = 2 * (ratio + fresnel_phase(exposures, raster)) * detector_transfer(exposures, raster)
     known = spectra(frames, exposures, h, raster, options.noise, options.model_error, options.prior, missing=missing)
     contrast = completed(contrast, missing, crop, known)
-    contact = 1 + 2 * ratio * filtered(contrast, known.inverse)
+    contact = 1 + 2 * ratio * known.poses.sum(filtered(contrast, known.inverse))
     mu = column(2 * wavenumber(exposures.energy_kev) * exposures.refraction(delta, beta)[1])
     return (-torch.log(contact.clamp_min(1e-6)) / mu)[crop].to(frames.dtype)
 
@@ -123,7 +123,7 @@ def contrast_transfer(
     h = response(exposures, beta / delta, raster)
     known = spectra(frames, exposures, h, raster, options.noise, options.model_error, options.prior, missing=missing)
     contrast = completed(contrast, missing, crop, known)
-    return (-filtered(contrast, known.inverse) * radian(exposures, delta))[crop].to(frames.dtype)
+    return (-known.poses.sum(filtered(contrast, known.inverse)) * radian(exposures, delta))[crop].to(frames.dtype)
 
 
 PerView = float | np.ndarray

@@ -120,7 +120,7 @@ class WaveModel:
         ).to(self.frames.device)
         h, prior = response(exposures, ratio, self.raster), prior or (FIXED if any(leaves) else None)
         self.spectra = spectra(frames, exposures, h, self.raster, noise, MODEL_ERROR, prior, missing=missing)
-        self.strongest = column(sensitivity(exposures, ratio) ** 2)
+        self.strongest = self.spectra.poses.sum(column(sensitivity(exposures, ratio) ** 2))
         self.support, self.phase = self._spread(estimate)
 
     def _spread(self, estimate: Estimate) -> tuple[Tensor, Tensor]:
@@ -157,7 +157,7 @@ class WaveModel:
         return hologram(phase[:, None], [(self.sign, self.sign * self.ratio)], self.path, self.backend)
 
     def misfit(self, phase: Tensor) -> tuple[Tensor, Tensor]:
-        """`½ Σ (√I(φ) - √I)²` [V], float64, and its gradient [V, H, W].
+        """`½ Σ (√I(φ) - √I)²` [V], float64, over all frames of the pose of each, and its gradient [V, H, W].
 
         Roots of counts have the same variance, ¼, everywhere (Anscombe 1948), so each pixel counts as it should.
         """
@@ -166,7 +166,8 @@ class WaveModel:
         difference = difference if self.missing is None else difference.masked_fill(self.missing, 0.0)
         value = 0.5 * difference.double().square().sum(dim=(1, 2))
         (gradient,) = torch.autograd.grad(value.sum(), at)
-        return value.detach(), gradient
+        poses = self.spectra.poses
+        return poses.sum(value.detach()), poses.sum(gradient)
 
     def curvature(self) -> Tensor:
         """About the misfit's second derivative [V, H, W//2 + 1] by spatial frequency, never too small at the lowest.
@@ -180,7 +181,8 @@ class WaveModel:
         slope2 = slope2.cpu() / self.exposures.views.pixel_size**2
         lam_z = torch.from_numpy(wavelength(self.exposures.energy_kev) * self.exposures.distance)
         shift = (lam_z.square() * slope2)[:, None, None] * squared_frequency(self.raster)
-        return (0.25 * self.spectra.response.square() + CROSS_TERM * shift) / self.oversample**2
+        each = 0.25 * self.spectra.response.square() + CROSS_TERM * shift
+        return self.spectra.poses.sum(each) / self.oversample**2
 
     def filter(self, images: Tensor, factor: Tensor) -> Tensor:
         """`images` [V, H, W] with their spectra times `factor` [V, H, W//2 + 1]."""
@@ -195,7 +197,7 @@ def view_by_view(
     solve: Callable[[Tensor, Exposures, Noise, Gaps, Advance], Tensor],
     on_progress: Advance,
 ) -> Tensor:
-    """`solve(frames, exposures, noise, missing, on_progress)` of views alike, some at a time, with frames checked;
+    """`solve(frames, exposures, noise, missing, on_progress)` of views `alike`, some at a time, with frames checked;
     beside: noise and missing pixels."""
     (noise, missing), frames = beside, checked(frames, exposures, delta)
     found, done = torch.empty_like(frames), 0

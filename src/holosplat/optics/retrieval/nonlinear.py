@@ -73,7 +73,7 @@ def penalty_weights(model: WaveModel, weight: float) -> Tensor:
     seen = squared_frequency(model.raster) <= (0.5 / model.exposures.views.pixel_size) ** 2
     found = torch.fft.rfft2(model.phase.cpu().double()).abs().square() / math.prod(model.raster.shape)
     scale = found[:, seen].mean(dim=1) / model.oversample**2 / known.power[:, seen].mean(dim=1)
-    variance = 0.25 * known.unexplained / scale.clamp_min(TINY)[:, None, None]
+    variance = 0.25 * known.poses.mean(known.unexplained) / scale.clamp_min(TINY)[:, None, None]
     stiffness = (weight * variance / known.power).minimum(STIFFEST * model.strongest)
     return stiffness / model.oversample**2
 

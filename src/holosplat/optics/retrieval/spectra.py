@@ -21,7 +21,8 @@ from ...scan import Exposures
 from ...units import wavelength, wavenumber
 from ..noise import noise_levels, with_gaps
 from ..noise_model import NoiseModel
-from ..sampling import smooth_margin
+from ..propagation import transfer_phase
+from ..sampling import SharedPoses, smooth_margin
 
 TINY = 1e-24
 """Variance added for frames without any contrast."""
@@ -105,9 +106,9 @@ def squared_frequency(raster: Raster) -> Tensor:
 
 
 def fresnel_phase(exposures: Exposures, raster: Raster) -> Tensor:
-    """`χ = πλz f²` [V, H, W//2 + 1] of each exposure's distance."""
-    lam_z = torch.from_numpy(wavelength(exposures.energy_kev) * exposures.distance)
-    return math.pi * lam_z[:, None, None] * squared_frequency(raster)
+    """`χ = πλz f²` [V, H, W//2 + 1] of each exposure's distance, or that of the angular spectrum."""
+    f2, optics = squared_frequency(raster), (exposures.distance, exposures.energy_kev)
+    return transfer_phase(f2, raster.shape, raster.pitch, *optics)
 
 
 def detector_transfer(exposures: Exposures, raster: Raster) -> Tensor:
@@ -157,12 +158,13 @@ class Spectra:
     """The response H and the expected power S of the phase, both [V, H, W//2 + 1], and two standard deviations [V] of
     the frames: of the white noise alone, and of this noise with the model error; grain: power [V, H, W//2 + 1] of
     correlated noise beside both, None without any; leak: power [V, H, W//2 + 1] that a frame's edges carry here from
-    half a cycle away. All float64."""
+    half a cycle away; poses: those that several frames show, which have one power. All float64."""
 
     response: Tensor
     power: Tensor
     noise: Tensor
     error: Tensor
+    poses: SharedPoses
     grain: Tensor | None = None
     leak: Tensor | float = 0.0
 
@@ -173,49 +175,25 @@ class Spectra:
         return white if self.grain is None else white + self.grain
 
     def noise_of(self, gain: Tensor) -> Tensor:
-        """Standard deviation [V] of what a filter `gain` [V, H, W//2 + 1] makes of the noise."""
+        """Standard deviation [V] of what filters `gain` [V, H, W//2 + 1] make of the noise of all frames of a pose."""
         if self.grain is None:
-            return self.noise * gain.square().mean(dim=(1, 2)).sqrt()
-        return (gain.square() * (self.noise.square()[:, None, None] + self.grain)).mean(dim=(1, 2)).sqrt()
+            return self.poses.sum(self.noise.square() * gain.square().mean(dim=(1, 2))).sqrt()
+        noise = gain.square() * (self.noise.square()[:, None, None] + self.grain)
+        return self.poses.sum(noise.mean(dim=(1, 2))).sqrt()
+
+    @property
+    def own_inverse(self) -> Tensor:
+        """Wiener's inverse `H S / (H² S + σ²)` of the response of each frame by itself."""
+        return self.response * self.power / (self.response.square() * self.power + self.unexplained)
 
     @property
     def inverse(self) -> Tensor:
-        """Wiener's inverse `H S / (H² S + σ²)` of the response."""
-        return self.response * self.power / (self.response.square() * self.power + self.unexplained)
-
-
-FILLINGS = 50
-"""Steps of conjugate gradients in which missing pixels take what the others say of them."""
-
-
-def completed(contrast: Tensor, missing: Gaps, crop: tuple[slice, slice, slice], known: Spectra) -> Tensor:
-    """The contrast [V, H, W] with missing pixels as the likeliest phase of the others predicts them.
-
-    missing: of the frame, which `crop` takes out of the contrast. With K = H W, the response after Wiener's inverse,
-    the values x in the gaps solve `x = P K (c + x)`, P being their projection: expectation and maximisation in one
-    (Dempster et al. 1977). So the pixels have no weight.
-    """
-    if missing is None or not missing.any():
-        return contrast
-    gain, gaps = known.inverse * known.response, torch.zeros_like(contrast)
-    gaps[crop] = missing.to(gaps)
-
-    def explained(images: Tensor) -> Tensor:
-        return gaps * filtered(images, gain)
-
-    def squared(images: Tensor) -> Tensor:
-        return images.square().sum(dim=(1, 2), keepdim=True)
-
-    c = contrast * (1 - gaps)
-    x, left = torch.zeros_like(c), explained(c)
-    way, size = left, squared(left)
-    for _ in range(FILLINGS):
-        slope = way - explained(way)
-        length = size / (way * slope).sum(dim=(1, 2), keepdim=True).clamp_min(TINY)
-        x, left = x + length * way, left - length * slope
-        size, before = squared(left), size
-        way = left + size / before.clamp_min(TINY) * way
-    return c + x
+        """The part of each frame in Wiener's inverse of all frames of its pose, `S H/σ² / (1 + S Σ H²/σ²)`: the least
+        squares of Cloetens et al. (1999), eq. 4, with the weights of the noise."""
+        if not self.poses.any:
+            return self.own_inverse
+        weight = self.response / self.unexplained
+        return self.power * weight / (1 + self.power * self.poses.sum(self.response * weight))
 
 
 def spectra(
@@ -252,9 +230,12 @@ def spectra(
     shape = (f2 * field + corner**2) ** -decay
     seen = f2 <= (0.5 / exposures.views.pixel_size) ** 2
     explained = (h.square() * shape)[:, seen].mean(dim=1)
-    power = shape * (signal / explained)[:, None, None]
+    power, poses = shape * (signal / explained)[:, None, None], SharedPoses(exposures)
+    if poses.any:  # frames that hardly show the phase hardly say what its power is
+        told = (signal / error.square())[:, None, None]
+        power = poses.sum(told * power) / poses.sum(told)
     leak = _changes(h, raster, exposures).square() * power if leaks else 0.0
-    return Spectra(h, power, level, error, grain, leak)
+    return Spectra(h, power, level, error, poses, grain, leak)
 
 
 def _changes(h: Tensor, raster: Raster, exposures: Exposures) -> Tensor:

@@ -1,0 +1,114 @@
+"""Sources at a finite distance: effective pixel and distance of every foreign file, Nikon's among them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import tifffile
+
+from holosplat.checks import InputError
+from holosplat.geometry import Views
+from holosplat.io.formats import read, read_as
+from holosplat.io.nxtomo import write_scan
+from holosplat.io.reading import Reading, Told
+from holosplat.optics.coherence import effective_geometry
+from holosplat.scan import Exposures, Scan
+
+SOURCE, BEHIND, PIXEL = 0.25, 0.75, 4e-6
+WANTED = effective_geometry(SOURCE, BEHIND, PIXEL)
+SHAPE = (11, 14)
+
+
+def a_folder(path: Path, count: int = 3) -> Path:
+    path.mkdir()
+    for n in range(count):
+        tifffile.imwrite(path / f"capsule_{n + 1:04d}.tif", np.full(SHAPE, 30000 + 1000 * n, dtype=np.uint16))
+    return path
+
+
+def nikon(folder: Path, change: dict[str, str] | None = None) -> Path:
+    """A file as a scanner writes it, lengths in mm."""
+    entries = {
+        **{"Name": "capsule", "SrcToObject": "250.0", "SrcToDetector": "1000", "DetectorPixelsX": "14"},
+        **{"DetectorPixelsY": "11", "DetectorPixelSizeX": "0.004", "DetectorPixelSizeY": "0.004"},
+        **{"Projections": "3", "InitialAngle": "-3.5", "AngularStep": "0.25", "WhiteLevel": "60000"},
+        **(change or {}),
+    }
+    text = "\r\n".join(["[XTekCT]", *(f"{name}={value}" for name, value in entries.items() if value)])
+    (folder / "scan.xtekct").write_text(f"{text}\r\n\r\n[Xrays]\r\nXraykV=120\r\n")
+    return folder / "scan.xtekct"
+
+
+def test_a_nikon_file_is_read_with_its_images(tmp_path: Path):
+    found = read(nikon(a_folder(tmp_path / "run")), {"energy_kev": 60.0})
+    exposures = found.exposures
+    assert exposures.views.pixel_size == pytest.approx(WANTED.pixel_size, rel=1e-12)
+    assert exposures.distance == pytest.approx([WANTED.distance] * 3, rel=1e-12)
+    angles = np.rad2deg(np.arctan2(exposures.views.rotations[:, 0, 2], exposures.views.rotations[:, 0, 0]))
+    assert angles == pytest.approx([-3.5, -3.25, -3.0])
+    assert found.frames[:, 4, 5] == pytest.approx(np.array([0.5, 31 / 60, 32 / 60]), rel=1e-6)
+    told = read(tmp_path / "run/scan.xtekct", {"energy_kev": 60.0, "pixel_size": 2e-6}).exposures
+    assert told.views.pixel_size == 2e-6  # effective, as it is said everywhere
+    assert told.distance == pytest.approx([WANTED.distance] * 3, rel=1e-12)
+
+
+def test_a_nikon_file_finds_its_images_in_another_folder(tmp_path: Path):
+    a_folder(tmp_path / "raw")
+    assert len(read(nikon(tmp_path, {"InputFolderName": "raw"}), {"energy_kev": 60.0})) == 3
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"SrcToObject": ""}, "SrcToObject must be a number, but it is missing"),
+        ({"AngularStep": "a"}, "AngularStep must be a number, but it is a"),
+        ({"Projections": "4"}, "Projections must be the number of images named capsule, 3, but it is 4"),
+        ({"SrcToDetector": "200"}, "SrcToDetector must be above SrcToObject"),
+        ({"DetectorPixelSizeY": "0.005"}, "detector pixels must be square"),
+        ({"WhiteLevel": "0"}, "WhiteLevel must be above 0"),
+        ({"Name": "other"}, "images whose names begin with 'other', but it holds none"),
+        ({"InputFolderName": "gone"}, "InputFolderName must be a folder"),
+        ({"SrcToObject": "0.1", "SrcToDetector": "1"}, r"the source: a source 0\.0001 m before .* a cone of rays"),
+    ],
+)
+def test_nikon_files_that_cannot_be_are_refused(change, said, tmp_path: Path):
+    with pytest.raises(InputError, match=said):
+        read(nikon(a_folder(tmp_path / "run"), change), {"energy_kev": 60.0})
+
+
+@pytest.mark.parametrize("text", ["no section", "[Other]\na=1\n"])
+def test_what_is_no_nikon_file_is_refused(text, tmp_path: Path):
+    (tmp_path / "scan.xtekct").write_text(text)
+    with pytest.raises(InputError, match=r"scan\.xtekct must (be a text file of|have a section)"):
+        read(tmp_path / "scan.xtekct", {"energy_kev": 60.0})
+
+
+def test_a_source_that_is_said_makes_images_parallel(tmp_path: Path):
+    (tmp_path / "angles.txt").write_text("0\n1\n2\n")
+    told = Told(20.0, distance=BEHIND, pixel_size=PIXEL, source_distance=SOURCE, angles=tmp_path / "angles.txt")
+    found = read_as(a_folder(tmp_path / "run"), Reading(told)).exposures
+    assert (found.views.pixel_size, found.distance[0]) == pytest.approx((WANTED.pixel_size, WANTED.distance), rel=1e-12)
+
+
+@pytest.mark.parametrize("said", [{}, {"distance": BEHIND}, {"distance": BEHIND, "pixel_size": PIXEL}])
+def test_a_source_that_is_said_goes_before_that_of_a_file(said, tmp_path: Path):
+    """Both make the same parallel beam, once."""
+    views = Views.evenly_spaced(2, shape=SHAPE, pixel_size=PIXEL)
+    write_scan(tmp_path / "s.nxs", Scan(np.ones((2, *SHAPE)), Exposures.of(views, 20.0, BEHIND), np.zeros(2)))
+    own = read(tmp_path / "s.nxs", {"source_distance": SOURCE, **said}).exposures
+    with h5py.File(tmp_path / "s.nxs", "a") as file:
+        file["entry/instrument/source/distance"] = -2.0
+    both = read(tmp_path / "s.nxs", {"source_distance": SOURCE, **said}).exposures
+    for found in (own, both):
+        assert found.views.pixel_size == pytest.approx(WANTED.pixel_size, rel=1e-12)
+        assert found.distance == pytest.approx([WANTED.distance] * 2, rel=1e-12)
+
+
+def test_a_source_that_is_too_near_is_refused(tmp_path: Path):
+    (tmp_path / "angles.txt").write_text("0\n1\n2\n")
+    told = Told(20.0, distance=0.02, pixel_size=2e-4, source_distance=0.01, angles=tmp_path / "angles.txt")
+    with pytest.raises(InputError, match=r"--source-distance: .* cone of rays"):
+        read_as(a_folder(tmp_path / "run"), Reading(told))
