@@ -259,21 +259,27 @@ def _middle(
     when, centres = times[[seen[k].time for k in whole]], np.array([seen[k].centre for k in whole])
     dense, velocity = np.linspace(basis.first, basis.last, 4 * basis.count), flow * (basis.degree > 0)
 
-    def path(degree: int, kept: np.ndarray, at: np.ndarray) -> np.ndarray:
-        away = centres[kept] - (when[kept] - basis.first)[:, None] * velocity
-        powers = np.polynomial.polynomial.polyfit((when[kept] - basis.first) / scale, away, degree)
-        return (
-            np.polynomial.polynomial.polyval((at - basis.first) / scale, powers).T
-            + (at - basis.first)[:, None] * velocity
-        )
+    scale = basis.last - basis.first
+    away = centres - (when - basis.first)[:, None] * velocity
+    chosen = path_degree((when - basis.first) / scale, away, min(2, basis.degree))
+    if chosen > 0:
+        powers = np.polynomial.polynomial.polyfit((when - basis.first) / scale, away, chosen)
+        path = np.polynomial.polynomial.polyval((dense - basis.first) / scale, powers).T
+        return basis.fitted(dense, path + (dense - basis.first)[:, None] * velocity)
+    return basis.fitted(dense, seen[best].centre + (dense - times[seen[best].time])[:, None] * velocity)
+
+
+def path_degree(when: np.ndarray, centres: np.ndarray, most: int) -> int:
+    """The degree, up to `most`, of the polynomial through `centres` [N, K] at times `when` [N], of order one, that
+    predicts those left out; the least is the null, and 0 stands for too few."""
 
     def left_out(name: str, fold: int) -> Score:
-        every = np.arange(len(whole))
-        missed = [centres[k] - path(int(name), every != k, when[[k]])[0] for k in every]
+        missed = []
+        for k in range(len(when)):
+            kept = np.arange(len(when)) != k
+            powers = np.polynomial.polynomial.polyfit(when[kept], centres[kept], int(name))
+            missed.append(centres[k] - np.polynomial.polynomial.polyval(when[k], powers))
         return Score(np.square(missed).sum(axis=1)[:, None])
 
-    degrees, scale = [str(n) for n in range(min(2, basis.degree) + 1) if len(whole) > n + 1], basis.last - basis.first
-    chosen = int(select("degree of a path", degrees, left_out, by="detections left out").choice) if degrees else 0
-    if chosen > 0:
-        return basis.fitted(dense, path(chosen, np.arange(len(whole)), dense))
-    return basis.fitted(dense, seen[best].centre + (dense - times[seen[best].time])[:, None] * velocity)
+    degrees = [str(n) for n in range(most + 1) if len(when) > n + 1]
+    return int(select("degree of a path", degrees, left_out, by="detections left out").choice) if degrees else 0

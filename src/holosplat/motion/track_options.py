@@ -10,8 +10,7 @@ from ..fit.schedule import Schedule
 from ..learning.start import LearnedStart
 from ..ranges import Share, ranged
 from .detections import SightingOptions
-from .fit import MotionFit, converged
-from .pieces import PathOptions
+from .fit import MotionFit, PathOptions, converged
 from .track_linking import LinkOptions
 
 
