@@ -22,7 +22,8 @@ from holosplat.io.objects import read_object
 from holosplat.methods import HolographicVoxels
 from holosplat.methods.continued import Continued
 from holosplat.series import one_time as series_time
-from holosplat.series.folder import SeriesFolder, line_of, verdict_of
+from holosplat.series import task
+from holosplat.series.folder import SeriesFolder, line_of, verdict_of, write_row
 from holosplat.series.plan import Settings
 from holosplat.series.run import run_left, states
 from holosplat.series.task import attempted, run_task
@@ -46,11 +47,12 @@ def test_a_time_that_finds_no_memory_says_so(error):
 
 
 def test_times_have_runs_and_rows(done, files):
-    """The first time of a task begins by itself, the next one with what that ended with."""
+    """The first time of a task begins by itself, the next one with what that ended with; then one that is worse than
+    the next one goes on from that."""
     windows = done.plan().windows()
     assert [[m.number for m in w.moments] for w in windows] == [[0, 1], [2, 3], [4]]
     rows = [row for window in windows for row in done.rows(window)]
-    assert [row.begun for row in rows] == ["cold", "warm", "cold", "warm", "cold"]
+    assert [row.begun for row in rows] == ["cold", "warm", "back", "warm", "cold"]
     assert [row.time_s for row in rows] == [0.0, 0.5, 1.0, 1.5, 2.0]
     assert all(row.done and row.good and 0 < row.test["ssim"] <= 1 for row in rows)
     config = RunFolder(done.run(0, 1)).read_config()
@@ -183,6 +185,41 @@ def test_other_matter_begins_anew(files, tmp_path):
         path.unlink()
     run_task(folder, 0)
     assert replace(folder.rows(window)[1], seconds=0.0) == replace(rows[1], seconds=0.0)
+
+
+def test_a_bad_time_is_tried_again_from_the_one_after_it(files, tmp_path, monkeypatch):
+    """The first time finds other matter, the second one begins anew; on the way back the first goes on from the second.
+    What is cut off before its row is written goes on to the same row, and nothing is tried twice."""
+    real, other, tried = series_time.reconstruct, moving(1, seeds=(4,)).as_static(), list[str]()
+
+    def misled(scan, *args, folder, **how):
+        tried.append(folder.path.name)
+        return real(other if folder.path.name == "t0000" and len(tried) < 3 else scan, *args, folder=folder, **how)
+
+    def cut_off(path, row):
+        if row.begun == "back":
+            raise KeyboardInterrupt
+        write_row(path, row)
+
+    monkeypatch.setattr(series_time, "reconstruct", misled)
+    folder = planned(tmp_path / "series", files.scan)
+    window = folder.plan().windows()[0]
+    with monkeypatch.context() as patch:
+        patch.setattr(task, "write_row", cut_off)
+        with pytest.raises(KeyboardInterrupt):
+            run_task(folder, 0)
+    before = folder.rows(window)
+    assert [row.begun for row in before] == ["cold", "anew"]
+    run_task(folder, 0)
+    rows = folder.rows(window)
+    assert [row.begun for row in rows] == ["back", "anew"]
+    assert rows[0].decided.startswith("begun: back (training frames")
+    assert rows[0].train["psnr"] > before[0].train["psnr"] + 3
+    assert tried == ["t0000", "t0001", "t0001.cold", "t0000.back", "t0000"]
+    assert sorted(path.name for path in folder.task(0).glob("t*") if path.is_dir()) == ["t0000", "t0001"]
+    (folder.task(0) / "done.json").unlink()
+    run_task(folder, 0)
+    assert folder.rows(window) == rows
 
 
 def test_a_series_says_which_times_are_not_explained(done):

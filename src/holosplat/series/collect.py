@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +12,7 @@ from scipy.optimize import linear_sum_assignment
 
 from ..io.atomic import write_rows
 from ..tables import number_in
+from .events import EVENT_COLUMNS, PARTS, TRACK_COLUMNS, History, Parts
 from .folder import Body, Row, SeriesFolder, TaskState, plain, time_left
 from .one_time import PHASE
 from .plan import Moment, SeriesPlan
@@ -134,13 +135,18 @@ def _mean_distance(
 
 
 def collect(folder: SeriesFolder) -> Collected:
-    """Write series.csv, bodies.csv and series.html of what is done so far."""
+    """Write series.csv, bodies.csv, events.csv, tracks.csv and series.html of what is done so far."""
     from .page import write_page  # which needs matplotlib
 
     found = collected(folder)
+    seen = [(moment, run / PARTS) for moment, run in zip(found.moments, found.runs) if (run / PARTS).is_file()]
+    history = History.of([Parts.read(path) for _, path in seen])
+    numbers, times = [moment.number for moment, _ in seen], [moment.time for moment, _ in seen]
+    write_rows(folder.events, EVENT_COLUMNS, history.event_rows(numbers, times))
+    write_rows(folder.tracks, TRACK_COLUMNS, history.track_rows(numbers, times))
     write_rows(folder.table, COLUMNS, _lines(folder, found))
     write_rows(folder.bodies, BODY_COLUMNS, _body_lines(found))
-    write_page(folder.page, page_of(folder, found))
+    write_page(folder.page, replace(page_of(folder, found), events=tuple(history.lines(times))))
     return found
 
 
