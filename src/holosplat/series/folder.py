@@ -152,6 +152,7 @@ class SeriesFolder:
         self.bodies = self.path / "bodies.csv"
         self.events = self.path / "events.csv"
         self.tracks = self.path / "tracks.csv"
+        self.fronts = self.path / "fronts.csv"
         self.page = self.path / "series.html"
         self.script = self.path / "slurm.sh"
         self.logs = self.path / "logs"

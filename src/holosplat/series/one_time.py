@@ -113,18 +113,17 @@ def reconstruct_time(
 def is_worse(shot: Shot, own: Before, after: Before, later: Scan) -> bool:
     """Whether a finished time is to be tried again from the time after it, which has the frames `later`.
 
-    So it is where only that one is explained, or this one explains its frames surely less well than that one its own;
-    and not where it was tried before.
+    So it is where it is not explained, and that one is, or explains its frames surely better; not where it was tried.
     """
     if (own.folder.path / BACK).is_file():
         return read_json(own.folder.path / BACK)["decided"] != own.row.decided  # it was cut off before its row
-    if not _same_field(after, shot.scan):
+    if own.row.good or not _same_field(after, shot.scan):
         return False
+    if after.row.good:
+        return True
     mine = _left(load_reconstruction(own.folder), shot.scan)
     others = _left(load_reconstruction(after.folder), later)
-    if mine.powers.shape != others.powers.shape:
-        return False
-    return bool(after.row.good and not own.row.good) or Compared("", *mine.gain_over(others)).loses
+    return mine.powers.shape == others.powers.shape and Compared("", *mine.gain_over(others)).loses
 
 
 def retry_time(shot: Shot, settings: Settings, own: Before, after: Before, on_progress: FitProgress = quiet) -> Row:

@@ -96,8 +96,8 @@ def _work(folder: SeriesFolder, plan: SeriesPlan, window: Window, on_row: OnRow)
 
 
 def _back(folder: SeriesFolder, plan: SeriesPlan, window: Window, scans: Scans, on_row: OnRow) -> str:
-    """Go back over the finished times once: one that is worse than the time after it is tried again from there. Why not
-    all of them could be, or nothing."""
+    """Go back over the finished times once, and try those again that are worse than the time after them (`is_worse`);
+    why not all of them could be, or nothing."""
     failed, after = list[str](), list[tuple[Before, Scan]]()
     for moment in reversed(window.moments):
         path, shot = folder.row(window.number, moment.number), _shot(plan, moment, scans)
