@@ -33,7 +33,7 @@ from holosplat.mesh import TriangleMesh
 from holosplat.methods import METHODS, Gaussians, Pinn, SurfaceOptions
 from holosplat.motion.fit import MotionFit
 from holosplat.motion.flow_reconstruction import FlowOptions
-from holosplat.motion.track_options import TrackOptions
+from holosplat.motion.track_linking import TrackOptions
 from holosplat.planning import acts
 from holosplat.planning.needs import Needs, of_reconstruction
 from holosplat.planning.needs import Sizes as NeedsSizes

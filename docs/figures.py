@@ -73,6 +73,7 @@ FIGURES = {
         "thesis",
     ),
     "compact": Figure(("compact.png",), "compact"),
+    "droplets": Figure(("droplets.png",), "droplets"),
     "matter": Figure(
         tuple(f"matter/{kind}.png" for kind in matter.KINDS),
         "matter",

@@ -156,3 +156,21 @@ def gpu_runs() -> str:
         lines.append([row["pixels"], row["machine"], *scores, row["seconds"], row["cpu_seconds"]])
     head = ("pixels", "machine", "SSIM", "FRCM", "Dice", "error of δ", "time / s", "of processors / s")
     return markdown(head, lines)
+
+
+@table("droplets", "python benchmarks/droplets.py --data FILE", "half an hour", "droplets_forecast.csv")
+def droplets() -> str:
+    """Forecasts of measured droplets, the nearest to the frame's middle first."""
+    rows = sorted(read("droplets_forecast.csv"), key=lambda r: max(abs(float(r["x_px"])), abs(float(r["y_px"]))))
+    head = ("x, y (pixels)", "z (mm)", "radius (µm)", "speed (mm/s)", "sightings, later", "missed, at most (pixels)")
+    lines = [
+        [
+            f"{float(r['x_px']):.0f}, {float(r['y_px']):.0f}",
+            *(f"{float(r[name]):.1f}" for name in ("z_mm", "radius_um", "speed_mm_s")),
+            f"{r['known']}, {r['later']}",
+            f"{float(r['missed_px']):.2f}",
+            f"{float(r['missed_z_mm']):.2f}",
+        ]
+        for r in rows
+    ]
+    return markdown((*head, "missed depth, at most (mm)"), lines)

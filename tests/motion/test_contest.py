@@ -17,7 +17,7 @@ from holosplat.inference import Decision, Score
 from holosplat.learning.weights import Card, Trained
 from holosplat.motion import body_tracker, track
 from holosplat.motion.track import NAME, compared_kinds, follow, unexplained
-from holosplat.motion.track_options import TrackOptions
+from holosplat.motion.track_linking import TrackOptions
 
 
 class Run:

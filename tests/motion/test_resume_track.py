@@ -14,9 +14,8 @@ from helpers.moving_ellipsoids import MATERIAL, PIXEL, TIMES, scan, true_paths
 from holosplat.fit import run as engine
 from holosplat.fit.schedule import Schedule
 from holosplat.motion import body_tracker, pieces
-from holosplat.motion.fit import motion_fit
+from holosplat.motion.fit import PathOptions, motion_fit
 from holosplat.motion.measures import ASTRAY, astray, halves_of, standard_errors, tell_shapes
-from holosplat.motion.pieces import PathOptions
 from holosplat.motion.track import TrackOptions, follow
 from holosplat.representations import TimeBasis
 

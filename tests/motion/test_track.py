@@ -28,8 +28,7 @@ from holosplat.motion.detections import (
     whole_ones,
     without_merger,
 )
-from holosplat.motion.fit import MotionFit, motion_fit
-from holosplat.motion.pieces import PathOptions, chosen_paths, refined
+from holosplat.motion.fit import MotionFit, PathOptions, chosen_paths, motion_fit, refined
 from holosplat.motion.track import TrackOptions, follow
 from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.specimens.red_cells import icosphere

@@ -18,7 +18,7 @@ from holosplat.geometry import Views
 from holosplat.learning.network import FINE, Size
 from holosplat.methods import METHODS, Pinn, SurfaceOptions
 from holosplat.motion.flow_reconstruction import FlowOptions
-from holosplat.motion.track_options import TrackOptions
+from holosplat.motion.track_linking import TrackOptions
 from holosplat.planning import acts
 from holosplat.planning.needs import Needs, Sizes, of_fit, of_reconstruction
 from holosplat.planning.scan_facts import coarser

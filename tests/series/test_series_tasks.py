@@ -22,7 +22,8 @@ from holosplat.io.objects import read_object
 from holosplat.methods import HolographicVoxels
 from holosplat.methods.continued import Continued
 from holosplat.series import one_time as series_time
-from holosplat.series.folder import SeriesFolder, line_of, verdict_of
+from holosplat.series import task
+from holosplat.series.folder import SeriesFolder, line_of, verdict_of, write_row
 from holosplat.series.plan import Settings
 from holosplat.series.run import run_left, states
 from holosplat.series.task import attempted, run_task
@@ -183,6 +184,46 @@ def test_other_matter_begins_anew(files, tmp_path):
         path.unlink()
     run_task(folder, 0)
     assert replace(folder.rows(window)[1], seconds=0.0) == replace(rows[1], seconds=0.0)
+
+
+def test_a_bad_time_is_tried_again_from_the_one_after_it(files, tmp_path, monkeypatch):
+    """The first time finds other matter, which is not explained; on the way back it goes on from the second, which is.
+    What is cut off before its row is written goes on to the same row, and nothing is tried twice."""
+    real, other, tried = series_time.reconstruct, moving(1, seeds=(4,)).as_static(), list[str]()
+
+    def misled(scan, *args, folder, **how):
+        tried.append(folder.path.name)
+        return real(other if folder.path.name == "t0000" and len(tried) < 3 else scan, *args, folder=folder, **how)
+
+    def judged(row, done, evaluation):
+        return replace(filled(row, done, evaluation), good=row.number > 0 or row.begun == "back")
+
+    def cut_off(path, row):
+        if row.begun == "back":
+            raise KeyboardInterrupt
+        write_row(path, row)
+
+    filled = series_time.filled
+    monkeypatch.setattr(series_time, "reconstruct", misled)
+    monkeypatch.setattr(series_time, "filled", judged)
+    folder = planned(tmp_path / "series", files.scan)
+    window = folder.plan().windows()[0]
+    with monkeypatch.context() as patch:
+        patch.setattr(task, "write_row", cut_off)
+        with pytest.raises(KeyboardInterrupt):
+            run_task(folder, 0)
+    before = folder.rows(window)
+    assert [row.begun for row in before] == ["cold", "anew"]
+    run_task(folder, 0)
+    rows = folder.rows(window)
+    assert [row.begun for row in rows] == ["back", "anew"]
+    assert rows[0].decided.startswith("begun: back (training frames")
+    assert rows[0].train["psnr"] > before[0].train["psnr"] + 3
+    assert tried == ["t0000", "t0001", "t0001.cold", "t0000.back", "t0000"]
+    assert sorted(path.name for path in folder.task(0).glob("t*") if path.is_dir()) == ["t0000", "t0001"]
+    (folder.task(0) / "done.json").unlink()
+    run_task(folder, 0)
+    assert folder.rows(window) == rows
 
 
 def test_a_series_says_which_times_are_not_explained(done):

@@ -205,16 +205,17 @@ def status(folder: Positional[Path]) -> None:
     print(time_left(found))
 
 
-def collect(folder: Positional[Path]) -> None:
-    """Join what the tasks of a series have done: series.csv, bodies.csv, and a page; what is missing is said.
+def collect(folder: Positional[Path], fronts: bool = False) -> None:
+    """Join what the tasks of a series have done: tables of times, bodies, events, and a page; what is missing is said.
 
     Exit code 4: something is missing.
 
     Args:
         folder: Folder of the series.
+        fronts: Also fit a spherical front to each time, such as of a shock: fronts.csv, with speed and step of δ.
     """
-    found = join(series := SeriesFolder(folder))
-    for path in (series.table, series.bodies, series.page):
+    found = join(series := SeriesFolder(folder), fronts)
+    for path in (series.table, series.bodies, series.events, series.tracks, series.page, *[series.fronts] * fronts):
         say(f"wrote {path}")
     put(verdict_of([row for row in found.rows if row is not None]))
     if found.missing:

@@ -34,12 +34,10 @@ from .detections import (
     without_merger,
 )
 from .elastic import Rest
-from .fit import MotionFit, motion_fit
+from .fit import MotionFit, chosen_paths, motion_fit
 from .known import KnownBodies, Trials, at_rest, chosen_twins
 from .measures import astray, halves_of, tell_shapes
-from .pieces import chosen_paths
-from .track_linking import first_paths
-from .track_options import TrackOptions
+from .track_linking import TrackOptions, first_paths
 
 STAGES = ("sightings", "first paths", "stiff", "beside", "paths", "soft", "twins", "soft again", "halves", "done")
 """In about their order: stiff fits and looks beside their bodies take turns."""

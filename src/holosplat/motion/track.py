@@ -17,7 +17,7 @@ from ..progress import FitProgress
 from ..scan import Scan
 from .body_tracker import BodyTracker, Followed, require_times
 from .detections import predicted
-from .track_options import TrackOptions
+from .track_linking import TrackOptions
 
 NAME, CELLS, ANY = "shape of the bodies", "red cells", "any shape"
 

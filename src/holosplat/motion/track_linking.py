@@ -1,19 +1,24 @@
-"""Links of detections into tracks, and bodies on first paths along them."""
+"""Links of detections into tracks, bodies on first paths along them, and the options of `track`."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from ..bodies.rest_shape import KnownBody
 from ..checks import at_least, in_range, require
+from ..fit.schedule import Schedule
 from ..inference import Score, select
+from ..learning.start import LearnedStart
 from ..matter import DeltaBeta, Matter
-from ..ranges import ranged
+from ..ranges import Share, ranged
 from ..representations import MovingSurfaces, TimeBasis
-from .detections import Detection
+from .detections import Detection, SightingOptions
+from .fit import MotionFit, PathOptions, converged
 
 FAR = 1e9
 """Cost of a pair that cannot be."""
@@ -259,21 +264,76 @@ def _middle(
     when, centres = times[[seen[k].time for k in whole]], np.array([seen[k].centre for k in whole])
     dense, velocity = np.linspace(basis.first, basis.last, 4 * basis.count), flow * (basis.degree > 0)
 
-    def path(degree: int, kept: np.ndarray, at: np.ndarray) -> np.ndarray:
-        away = centres[kept] - (when[kept] - basis.first)[:, None] * velocity
-        powers = np.polynomial.polynomial.polyfit((when[kept] - basis.first) / scale, away, degree)
-        return (
-            np.polynomial.polynomial.polyval((at - basis.first) / scale, powers).T
-            + (at - basis.first)[:, None] * velocity
-        )
+    scale = basis.last - basis.first
+    away = centres - (when - basis.first)[:, None] * velocity
+    chosen = path_degree((when - basis.first) / scale, away, min(2, basis.degree))
+    if chosen > 0:
+        powers = np.polynomial.polynomial.polyfit((when - basis.first) / scale, away, chosen)
+        path = np.polynomial.polynomial.polyval((dense - basis.first) / scale, powers).T
+        return basis.fitted(dense, path + (dense - basis.first)[:, None] * velocity)
+    return basis.fitted(dense, seen[best].centre + (dense - times[seen[best].time])[:, None] * velocity)
+
+
+def path_degree(when: np.ndarray, centres: np.ndarray, most: int) -> int:
+    """The degree, up to `most`, of the polynomial through `centres` [N, K] at times `when` [N], of order one, that
+    predicts those left out; the least is the null, and 0 stands for too few."""
 
     def left_out(name: str, fold: int) -> Score:
-        every = np.arange(len(whole))
-        missed = [centres[k] - path(int(name), every != k, when[[k]])[0] for k in every]
+        missed = []
+        for k in range(len(when)):
+            kept = np.arange(len(when)) != k
+            powers = np.polynomial.polynomial.polyfit(when[kept], centres[kept], int(name))
+            missed.append(centres[k] - np.polynomial.polynomial.polyval(when[k], powers))
         return Score(np.square(missed).sum(axis=1)[:, None])
 
-    degrees, scale = [str(n) for n in range(min(2, basis.degree) + 1) if len(whole) > n + 1], basis.last - basis.first
-    chosen = int(select("degree of a path", degrees, left_out, by="detections left out").choice) if degrees else 0
-    if chosen > 0:
-        return basis.fitted(dense, path(chosen, np.arange(len(whole)), dense))
-    return basis.fitted(dense, seen[best].centre + (dense - times[seen[best].time])[:, None] * velocity)
+    degrees = [str(n) for n in range(most + 1) if len(when) > n + 1]
+    return int(select("degree of a path", degrees, left_out, by="detections left out").choice) if degrees else 0
+
+
+@dataclass(frozen=True)
+@ranged
+class TrackOptions:
+    """How bodies are followed through time."""
+
+    kind: ClassVar[str] = "track"
+
+    body: KnownBody | None = None
+    """The known shape of bodies at rest, with which two beams are enough; None: unknown."""
+    sightings: SightingOptions = field(default_factory=SightingOptions)
+    """How bodies are found at single times."""
+    learned: LearnedStart | None = field(default_factory=LearnedStart)
+    """The network that may guess their volumes, where frames do not contradict it and its bodies explain clearly more;
+    None: none."""
+    cells: bool = True
+    """Whether, in two beams, bodies that a network of red cells guesses are followed as red cells, too, by their shape
+    at rest; these are kept unless bodies of any shape leave clearly less of the frames."""
+    links: LinkOptions = field(default_factory=LinkOptions)
+    """Which of them are one body."""
+    paths: PathOptions = field(default_factory=PathOptions)
+    """How the vertices move."""
+    rounds: int = 4
+    """How often bodies are looked for beside those that are known, at most."""
+    fainter: Share = 0.6
+    """Factor of the level there: few views smear a body, and beside what is known there is little to take it for."""
+    stiff: MotionFit = field(
+        default_factory=lambda: MotionFit(rate=0.4, stiffness=100.0, schedule=Schedule(steps=60, views_per_step=16))
+    )
+    """The first fit, in which bodies move and turn nearly as a whole."""
+    soft: MotionFit = field(default_factory=converged)
+    """The second one, in which they deform."""
+
+    twins: bool = True
+    """Whether to compare bodies of known shape with others that have the same shadows in two beams."""
+    intervals: bool = True
+    """Whether halves of the frames are fitted, too, for standard errors: up to four short fits."""
+    half: MotionFit = field(default_factory=lambda: MotionFit(rate=0.1, schedule=Schedule(steps=40, views_per_step=16)))
+    """The fit to a half, from the result: errors are hundredths of a pixel. By Adam: halves that L-BFGS fits to the end
+    agree on what both have from a known shape (two beams at 24°: volumes off by five standard errors). Where few beams
+    see bodies of unknown shape, halves begin apart and are fitted as all frames are, softly: short fits leave them so
+    (three beams: a tenth of the error that they say)."""
+
+    def with_effort(self, effort: float) -> TrackOptions:
+        """The same with `effort` times the steps, at least one."""
+        parts = {name: getattr(self, name) for name in ("stiff", "soft", "half")}
+        changed = {name: replace(part, schedule=part.schedule.with_effort(effort)) for name, part in parts.items()}
+        return replace(self, **changed)

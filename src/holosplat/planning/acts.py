@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ..methods import Method, Pinn
     from ..methods.surface_fit import SurfaceOptions
     from ..motion.flow_reconstruction import FlowOptions
-    from ..motion.track_options import TrackOptions
+    from ..motion.track_linking import TrackOptions
     from ..scan import Exposures
 
 LATTICE = 8

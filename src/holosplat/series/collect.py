@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from ..geometry import Grid
 from ..io.atomic import write_rows
+from ..io.objects import read_object
 from ..tables import number_in
+from ..workflows.run_folder import RunFolder
+from .events import EVENT_COLUMNS, FRONT_COLUMNS, PARTS, TRACK_COLUMNS, Front, History, Parts, front_rows
 from .folder import Body, Row, SeriesFolder, TaskState, plain, time_left
 from .one_time import PHASE
 from .plan import Moment, SeriesPlan
@@ -133,15 +137,31 @@ def _mean_distance(
     return float(np.mean(found)) if found else float("nan")
 
 
-def collect(folder: SeriesFolder) -> Collected:
-    """Write series.csv, bodies.csv and series.html of what is done so far."""
+def collect(folder: SeriesFolder, fronts: bool = False) -> Collected:
+    """Write series.csv, bodies.csv, events.csv, tracks.csv and series.html of what is done so far; fronts: also
+    fronts.csv, a spherical front of each time."""
     from .page import write_page  # which needs matplotlib
 
     found = collected(folder)
+    seen = [(moment, run / PARTS) for moment, run in zip(found.moments, found.runs) if (run / PARTS).is_file()]
+    history = History.of([Parts.read(path) for _, path in seen])
+    numbers, times = [moment.number for moment, _ in seen], [moment.time for moment, _ in seen]
+    write_rows(folder.events, EVENT_COLUMNS, history.event_rows(numbers, times))
+    write_rows(folder.tracks, TRACK_COLUMNS, history.track_rows(numbers, times))
     write_rows(folder.table, COLUMNS, _lines(folder, found))
     write_rows(folder.bodies, BODY_COLUMNS, _body_lines(found))
-    write_page(folder.page, page_of(folder, found))
+    if fronts:
+        write_rows(folder.fronts, FRONT_COLUMNS, front_rows(numbers, times, [_front(path.parent) for _, path in seen]))
+    write_page(folder.page, replace(page_of(folder, found), events=tuple(history.lines(times))))
     return found
+
+
+def _front(run: Path) -> Front:
+    """Of the object that a run found, on voxels of the pixels."""
+    folder = RunFolder(run)
+    seen = folder.read_summary()["detector"]
+    grid = Grid.centred((seen["columns"], seen["rows"], seen["columns"]), seen["pixel_size_m"])
+    return Front.of(read_object(folder.object).voxelise(grid))
 
 
 def _lines(folder: SeriesFolder, found: Collected) -> Iterable[list[object]]:

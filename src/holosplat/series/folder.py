@@ -16,7 +16,7 @@ from ..tables import from_table
 from .plan import SeriesPlan, Window
 
 ROW = "row.json"
-Begun = Literal["", "cold", "warm", "anew"]
+Begun = Literal["", "cold", "warm", "anew", "back"]
 Body = tuple[float, float, float, float]
 
 
@@ -26,7 +26,7 @@ class Row:
 
     - status: `done`, or `failed` for the `reason` given
     - begun: `cold`, by itself; `warm`, with what the time before ended with; `anew`, by itself, which was no worse than
-      warm; decided: by what evidence, where both were tried
+      warm; `back`, with what the time after ended with, which was no worse than that; decided: by what evidence
     - kind, size: of the object; unexplained: share of the matter that training frames leave; good: whether frames are
       explained; words: that in a sentence
     - test, train: means over held-out and training frames: ssim, frcm, psnr [dB], l1; empty where there are none
@@ -142,13 +142,17 @@ class TaskState:
 
 
 class SeriesFolder:
-    """`series.json` (the plan), tasks/0000 … (one folder a task), series.csv, bodies.csv and series.html."""
+    """`series.json` (the plan), tasks/0000 … (one folder a task), tables of times, bodies, events and tracks, and
+    series.html."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self.file = self.path / PLAN
         self.table = self.path / "series.csv"
         self.bodies = self.path / "bodies.csv"
+        self.events = self.path / "events.csv"
+        self.tracks = self.path / "tracks.csv"
+        self.fronts = self.path / "fronts.csv"
         self.page = self.path / "series.html"
         self.script = self.path / "slurm.sh"
         self.logs = self.path / "logs"

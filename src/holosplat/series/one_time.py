@@ -14,6 +14,7 @@ import torch
 
 from ..bodies.rest_shape import moments
 from ..checks import InputError
+from ..geometry import Grid
 from ..inference import Compared, Decision, Score
 from ..io.atomic import atomic_path
 from ..io.guard import read_array
@@ -29,17 +30,18 @@ from ..representations import Stored, SurfaceMesh
 from ..scan import Scan
 from ..units import wavenumber
 from ..workflows.evaluate import Evaluation, evaluate, render
-from ..workflows.reconstruct import reconstruct
+from ..workflows.reconstruct import load_reconstruction, reconstruct
 from ..workflows.reconstruction import Reconstruction
 from ..workflows.run_folder import RunFolder, claimed
-from .folder import Begun, Body, Row
+from .events import PARTS, Parts
+from .folder import Body, Row
 from .plan import Settings
 
 PHASE = "phase.npy"
 """The phase in the first view [rad], for pages."""
-BEGUN, REFERENCE = "begun.json", "reference.npy"
-"""How a time was begun, where that was decided; and what the last time that was begun by itself, or was compared with
-one that was, left of its frames: the powers of a `Score`."""
+BEGUN, BACK, REFERENCE = "begun.json", "back.json", "reference.npy"
+"""How a time was begun, where that was decided; the same on the way back; and what the last time that was begun by
+itself, or was compared with one that was, left of its frames: the powers of a `Score`."""
 WHAT = "what a time left of its frames"
 MOST_PIXELS = 160
 """Pixels along the longer edge of that, at most: it is binned until it has no more."""
@@ -58,7 +60,7 @@ class Shot:
 
 @dataclass(frozen=True)
 class Before:
-    """The time before: the folder of its run and its row."""
+    """The time before, or on the way back the time after: the folder of its run and its row."""
 
     folder: RunFolder
     row: Row
@@ -108,6 +110,49 @@ def reconstruct_time(
     return _written(shot, settings, folder, done, replace(shot.row, **said), began)
 
 
+def is_worse(shot: Shot, own: Before, after: Before, later: Scan) -> bool:
+    """Whether a finished time is to be tried again from the time after it, which has the frames `later`.
+
+    So it is where it is not explained, and that one is, or explains its frames surely better; not where it was tried.
+    """
+    if (own.folder.path / BACK).is_file():
+        return read_json(own.folder.path / BACK)["decided"] != own.row.decided  # it was cut off before its row
+    if own.row.good or not _same_field(after, shot.scan):
+        return False
+    if after.row.good:
+        return True
+    mine = _left(load_reconstruction(own.folder), shot.scan)
+    others = _left(load_reconstruction(after.folder), later)
+    return mine.powers.shape == others.powers.shape and Compared("", *mine.gain_over(others)).loses
+
+
+def retry_time(shot: Shot, settings: Settings, own: Before, after: Before, on_progress: FitProgress = quiet) -> Row:
+    """Try a finished time again from the time after it; an unfinished try is continued.
+
+    The better one is kept (`_better`), so that an error which a time handed on, or got from before, ends at the next
+    good one. Ctrl-C is passed on. Errors: `InputError` of `reconstruct`.
+    """
+    began, folder = time.perf_counter(), own.folder
+    method = Continued.of(settings.method, after.folder.object.resolve(), settings.warm.effort)
+    other = RunFolder(folder.path.with_name(f"{folder.path.name}.back"))
+    if (folder.path / BACK).is_file():
+        said = read_json(folder.path / BACK)
+        done = None if said["begun"] != "back" else _run(shot, settings, method, folder, on_progress, after)
+    else:
+        _remove_other(other, method)
+        tried = _run(shot, settings, method, other, on_progress, after)
+        decision = _better(shot, settings, {"back": tried, "kept": load_reconstruction(folder)})
+        done = None if decision.choice == "kept" else tried
+        said = {"begun": "back" if done else own.row.begun, "decided": decision.line}
+        write_json((other if done else folder).path / BACK, said)
+        shutil.rmtree((folder if done else other).path)
+        if done:
+            other.path.rename(folder.path)
+    if done is None:
+        return replace(own.row, **said)
+    return _written(shot, settings, folder, done, replace(shot.row, **said), began)
+
+
 def _left(done: Reconstruction, scan: Scan) -> Score:
     """The score of a result on the training frames of `scan`."""
     train = done.placed(scan).train()
@@ -134,7 +179,7 @@ def _as_good(left: Score, reference: Path) -> bool:
     return other.powers.shape == left.powers.shape and not Compared("", *left.gain_over(other)).loses
 
 
-def _better(shot: Shot, settings: Settings, found: Mapping[Begun, Reconstruction]) -> Decision:
+def _better(shot: Shot, settings: Settings, found: Mapping[str, Reconstruction]) -> Decision:
     """The better one of two results, the null last: by the policy of a run's states (`Keeper`)."""
     task = prepared(Task(shot.scan.train(), shot.prior, settings.seed, light=settings.light), settings.method)
     keeper = Keeper(task.scan, mixed=True, unseen=partial(decide_kind, task, settings.method))
@@ -198,6 +243,8 @@ def _written(shot: Shot, settings: Settings, folder: RunFolder, done: Reconstruc
         scan = done.placed(shot.scan)
         evaluation = evaluate(done, scan, None)
         write_phase(folder.path / PHASE, done.object, scan)
+        if done.object.matter.delta:
+            Parts.of(done.object, Grid.of_views(scan.views)).write(folder.path / PARTS)
         if not (folder.path / REFERENCE).is_file():
             _keep(folder, _left(done, shot.scan).powers)
         if settings.reports:

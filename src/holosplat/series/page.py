@@ -31,6 +31,8 @@ MOST_PICTURES = 160
 """Times whose phase map a page holds, at most: evenly chosen, about 8 kB each."""
 MOST_ROWS = 2000
 """Times in its table, at most, the last ones."""
+MOST_EVENTS = 200
+"""Events that it lists, at most, the first ones; events.csv has all."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +49,8 @@ class Frame:
 
 @dataclass(frozen=True)
 class SeriesPage:
-    """Content of a page. failed: reasons by what failed; refresh: seconds after which a browser reads it again; 0:
-    never."""
+    """Content of a page. failed: reasons by what failed; events: a line each; refresh: seconds after which a browser
+    reads it again; 0: never."""
 
     title: str
     headline: Headline
@@ -57,6 +59,7 @@ class SeriesPage:
     failed: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     refresh: float = 0.0
+    events: tuple[str, ...] = ()
 
 
 def write_page(path: Path, page: SeriesPage) -> None:
@@ -96,6 +99,7 @@ def render_page(page: SeriesPage) -> str:
         rows=[_cells(frame) for frame in page.frames[-MOST_ROWS:]],
         failed=page.failed,
         notes=(*page.notes, *unread),
+        events=page.events[:MOST_EVENTS],
         refresh=int(1000 * page.refresh),
     )
 

@@ -6,6 +6,7 @@ import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -24,8 +25,8 @@ from ..workflows.reconstruction import Reconstruction
 from ..workflows.run_folder import RunFolder, claimed
 from ..workflows.track import track
 from .folder import DONE, FAILED, Row, SeriesFolder, TaskState, read_row, write_row
-from .one_time import PHASE, Before, Shot, reconstruct_time, write_phase
-from .plan import Moment, SeriesPlan, Source, Window, at, fingerprint
+from .one_time import PHASE, Before, Shot, is_worse, reconstruct_time, retry_time, write_phase
+from .plan import Moment, SeriesPlan, Settings, Source, Window, at, fingerprint
 
 OnRow = Callable[[Row], None]
 """Called with every row that is written."""
@@ -90,8 +91,34 @@ def _work(folder: SeriesFolder, plan: SeriesPlan, window: Window, on_row: OnRow)
         else:
             failed.append(row)
     if not failed:
-        return ""
+        return _back(folder, plan, window, scans, on_row) if plan.settings.warm.on else ""
     return f"{len(failed)} of {len(window.moments)} times: {failed[0].reason}"
+
+
+def _back(folder: SeriesFolder, plan: SeriesPlan, window: Window, scans: Scans, on_row: OnRow) -> str:
+    """Go back over the finished times once, and try those again that are worse than the time after them (`is_worse`);
+    why not all of them could be, or nothing."""
+    failed, after = list[str](), list[tuple[Before, Scan]]()
+    for moment in reversed(window.moments):
+        path, shot = folder.row(window.number, moment.number), _shot(plan, moment, scans)
+        own = Before(RunFolder(folder.run(window.number, moment.number)), read_row(path))
+        found = list[Row]()
+        work = partial(_tried_again, shot, plan.settings, own, after, found)
+        failed += [reason] if (reason := attempted(work)) else []
+        for row in found:
+            write_row(path, row)
+            on_row(row)
+            own = replace(own, row=row)
+        after = [(own, shot.scan)]
+    return f"{len(failed)} times could not be tried again: {failed[0]}" if failed else ""
+
+
+def _tried_again(
+    shot: Shot, settings: Settings, own: Before, after: Sequence[tuple[Before, Scan]], found: list[Row]
+) -> str:
+    """Add the new row of a time that is tried again from the one `after` it, of its scan, to those `found`."""
+    found += [retry_time(shot, settings, own, later) for later, scan in after if is_worse(shot, own, later, scan)]
+    return ""
 
 
 def _remove(folder: SeriesFolder, task: int, moments: Sequence[Moment]) -> None:
@@ -102,20 +129,23 @@ def _remove(folder: SeriesFolder, task: int, moments: Sequence[Moment]) -> None:
 
 
 def _row(plan: SeriesPlan, moment: Moment, scans: Scans, run: RunFolder, before: Before | None) -> Row:
-    source = plan.sources[moment.source]
-    row = _blank(moment, source)
+    row = _blank(moment, plan.sources[moment.source])
 
     def work() -> str:
         nonlocal row
-        scan = at(scans.of(moment), moment.frame)
-        frame = moment.frame if len(source.times) > 1 else None
-        reading = replace(plan.reading, part=replace(plan.reading.part, time_frame=frame))
-        shot = Shot(scan, source.prior, run_source(source.path, reading), row)
-        row = reconstruct_time(shot, plan.settings, run, before)
+        row = reconstruct_time(_shot(plan, moment, scans), plan.settings, run, before)
         return ""
 
     reason = attempted(work)
     return replace(row, status="failed", reason=reason) if reason else row
+
+
+def _shot(plan: SeriesPlan, moment: Moment, scans: Scans) -> Shot:
+    source = plan.sources[moment.source]
+    frame = moment.frame if len(source.times) > 1 else None
+    reading = replace(plan.reading, part=replace(plan.reading.part, time_frame=frame))
+    scan = at(scans.of(moment), moment.frame)
+    return Shot(scan, source.prior, run_source(source.path, reading), _blank(moment, source))
 
 
 def _blank(moment: Moment, source: Source) -> Row:

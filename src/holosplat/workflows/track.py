@@ -24,7 +24,7 @@ from ..motion.elastic import Rest, strain_energy
 from ..motion.flow_reconstruction import FlowOptions, FlowResult, FlowSearch, merged
 from ..motion.measures import columns, measured, row, standard_errors
 from ..motion.track import USUAL, follow
-from ..motion.track_options import TrackOptions
+from ..motion.track_linking import TrackOptions
 from ..optics.background import LightOptions
 from ..optics.sampling import fringe_sampling
 from ..progress import FitProgress

@@ -1,0 +1,357 @@
+"""What happens between times: bodies and holes merge, split, appear and vanish, with tracks as a tree; fronts run."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from scipy import ndimage
+from scipy.optimize import least_squares
+from scipy.special import ndtr
+
+from ..bodies.rest_shape import LEAST_VOLUME, LEVEL
+from ..checks import as_written, require
+from ..geometry import Grid
+from ..io.atomic import atomic_path
+from ..motion.track_linking import path_degree
+from ..representations import Stored
+from ..volume import Volume
+
+PARTS = "parts.npz"
+"""The connected parts of a time, in its run folder."""
+MOST_VOXELS = 160
+"""Voxels along the longest edge of their volume, at most: larger fields have larger voxels."""
+Of = Literal["body", "hole"]
+WHAT: dict[Of, str] = {"body": "bodies", "hole": "holes"}
+EVENT_COLUMNS = ("first", "last", "first_s", "last_s", "event", "of", "before", "after", "x_m", "y_m", "z_m")
+FRONT_COLUMNS = (
+    *("number", "time_s", "x_m", "y_m", "z_m", "radius_m", "radius_error_m"),
+    *("step_delta", "step_error_delta", "speed_m_s", "speed_error_m_s"),
+)
+SHELL, THINNEST, NARROWEST, MOST_FITTED = 0.3, 2.0, 0.3, 20_000
+"""Half the thickness of the shell in which a front is fitted, as a share of its radius, and in voxels at least; the
+least width of the front [voxels]; voxels of the shell, at most."""
+TRACK_COLUMNS = ("track", "of", "first", "last", "first_s", "last_s", "parents", "first_volume_m3", "last_volume_m3")
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What hangs together at one time. bodies, holes: [Z, Y, X] numbers from 1 on, 0 elsewhere; grid: of both"""
+
+    bodies: np.ndarray
+    holes: np.ndarray
+    grid: Grid
+
+    @classmethod
+    def of(cls, found: Stored, grid: Grid) -> Parts:
+        """Bodies are what is above half of the matter's δ; holes what is not, and has matter all around it.
+
+        Parts of fewer than `LEAST_VOLUME` voxels are left out, and filled or emptied.
+        """
+        factor = -(-max(grid.shape) // MOST_VOXELS)
+        z, y, x = (-(-n // factor) for n in grid.shape)
+        centre = (o + 0.5 * (n - 1) * d for o, n, d in zip(grid.origin, grid.shape[::-1], grid.voxel_size))
+        coarse = Grid.centred((z, y, x), factor * grid.voxel_size[0], tuple(centre))  # type: ignore[arg-type]
+        full = found.voxelise(coarse).delta / found.matter.delta > LEVEL
+        around, beyond = _large(~full), np.zeros(0, dtype=int)
+        for axis in range(3):
+            beyond = np.union1d(beyond, [np.take(around, (0, -1), axis)])
+        bodies = _large(full | (around == 0))
+        return cls(bodies, _renumbered(np.where(np.isin(around, beyond), 0, around)), coarse)
+
+    def write(self, path: Path) -> None:
+        """Write them, whole or not at all."""
+        with atomic_path(path) as temporary, temporary.open("wb") as file:
+            place = np.array([*self.grid.voxel_size, *self.grid.origin])
+            np.savez_compressed(file, bodies=self.bodies, holes=self.holes, place=place)
+
+    @classmethod
+    def read(cls, path: Path) -> Parts:
+        """What `write` wrote. Errors: `InputError` for anything else."""
+        with as_written(path, "the parts of a time of a series"):
+            try:
+                with np.load(path, allow_pickle=False) as file:
+                    bodies, holes, place = (file[name] for name in ("bodies", "holes", "place"))
+            except (zipfile.BadZipFile, KeyError) as error:
+                raise ValueError(str(error)) from None
+            require(bodies.shape == holes.shape, "its arrays differ in shape.")
+            size, origin = place.tolist()[:3], place.tolist()[3:]
+            return cls(
+                bodies, holes, Grid(bodies.shape, (size[0], size[1], size[2]), (origin[0], origin[1], origin[2]))
+            )
+
+    def labels(self, of: Of) -> np.ndarray:
+        """Those of bodies, or of holes."""
+        return self.bodies if of == "body" else self.holes
+
+
+@dataclass
+class PartTrack:
+    """A part from one event to the next. first, last: positions in the series; parents: numbers of the tracks that it
+    came from; volumes: [m³] at each time"""
+
+    number: int
+    of: Of
+    first: int
+    last: int
+    parents: tuple[int, ...]
+    volumes: list[float]
+
+
+@dataclass(frozen=True)
+class Event:
+    """What happened between two times that follow each other. before, after: numbers of tracks; place: `(x, y, z)` m"""
+
+    first: int
+    last: int
+    kind: Literal["merger", "split", "appearance", "disappearance", "collapse", "rearrangement"]
+    of: Of
+    before: tuple[int, ...]
+    after: tuple[int, ...]
+    place: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class History:
+    """All tracks, and all events in the order of time."""
+
+    tracks: tuple[PartTrack, ...]
+    events: tuple[Event, ...]
+
+    @classmethod
+    def of(cls, parts: Sequence[Parts]) -> History:
+        """Of the parts at times that follow each other.
+
+        A part goes on in the one with which it shares most voxels, and comes from the one with which it shares most;
+        where they share none, in the nearest one within its radius. Parts that hang together so are one event, unless
+        they are one and one.
+        """
+        tracks, events = list[PartTrack](), list[Event]()
+        for of in ("body", "hole"):
+            _follow(of, parts, tracks, events)
+        return cls(tuple(tracks), tuple(sorted(events, key=lambda event: event.first)))
+
+    def lines(self, times: Sequence[float]) -> list[str]:
+        """Every event in words; times: [T] s."""
+        return [
+            f"{event.kind} between {times[event.first]:.6g} and {times[event.last]:.6g} s: "
+            f"{WHAT[event.of]} {_numbers(event.before)} → {_numbers(event.after)}"
+            for event in self.events
+        ]
+
+    def event_rows(self, numbers: Sequence[int], times: Sequence[float]) -> Iterable[list[object]]:
+        """Rows of `EVENT_COLUMNS`; numbers: of the times in the series."""
+        for event in self.events:
+            ends = (event.first, event.last)
+            when = [*(numbers[k] for k in ends), *(f"{times[k]:.9g}" for k in ends)]
+            parts = (" ".join(map(str, names)) for names in (event.before, event.after))
+            yield [*when, event.kind, event.of, *parts, *(f"{value:.6g}" for value in event.place)]
+
+    def track_rows(self, numbers: Sequence[int], times: Sequence[float]) -> Iterable[list[object]]:
+        """Rows of `TRACK_COLUMNS`."""
+        for one in self.tracks:
+            when = [*(numbers[k] for k in (one.first, one.last)), *(f"{times[k]:.9g}" for k in (one.first, one.last))]
+            ends = (f"{one.volumes[k]:.6g}" for k in (0, -1))
+            yield [one.number, one.of, *when, " ".join(map(str, one.parents)), *ends]
+
+
+def _numbers(names: Sequence[int]) -> str:
+    return " and ".join(map(str, names)) or "none"
+
+
+def _large(mask: np.ndarray) -> np.ndarray:
+    """Numbers of the connected parts of at least `LEAST_VOLUME` voxels."""
+    found = np.empty(mask.shape, dtype=np.int32)
+    ndimage.label(mask, output=found)  # pyright: ignore[reportArgumentType] (as in `bodies.rest_shape`)
+    small = np.bincount(found.ravel()) < LEAST_VOLUME
+    return _renumbered(np.where(small[found], 0, found))
+
+
+def _renumbered(labels: np.ndarray) -> np.ndarray:
+    """Numbers from 1 on without gaps, uint16."""
+    kept = np.unique(labels[labels > 0])
+    return np.searchsorted(kept, labels, side="left").astype(np.uint16) + np.uint16(1) * (labels > 0)
+
+
+def _measures(labels: np.ndarray, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+    """Centres [K, 3] `(x, y, z)` m and volumes [K] m³."""
+    every = np.arange(1, int(labels.max(initial=0)) + 1)
+    if not len(every):
+        return np.zeros((0, 3)), np.zeros(0)
+    places = np.array(ndimage.center_of_mass(labels > 0, labels, every))[:, ::-1]
+    volumes = np.bincount(labels.ravel(), minlength=len(every) + 1)[1:] * np.prod(grid.voxel_size)
+    return np.array(grid.origin) + places * np.array(grid.voxel_size), volumes
+
+
+def _edges(before: np.ndarray, now: np.ndarray, measured: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """[K, L] bool: which parts before are which now."""
+    k, n = (len(volumes) for _, volumes in measured)
+    shared = np.bincount(before.ravel().astype(np.int64) * (n + 1) + now.ravel(), minlength=(k + 1) * (n + 1))
+    shared = shared.reshape(k + 1, n + 1)[1:, 1:].astype(float)
+    if not k or not n:
+        return shared > 0
+    (old, size), (new, _) = measured
+    apart = np.linalg.norm(old[:, None] - new[None], axis=-1)
+    near = apart <= np.cbrt(0.75 / np.pi * size)[:, None]
+    lone = np.logical_and.outer(shared.sum(axis=1) == 0, shared.sum(axis=0) == 0) & near
+    shared = np.where(lone, 1 / (1 + apart / apart.max(initial=1e-30)), shared)
+    best = (shared == shared.max(axis=1, keepdims=True)) | (shared == shared.max(axis=0, keepdims=True))
+    return best & (shared > 0)
+
+
+def _follow(of: Of, parts: Sequence[Parts], tracks: list[PartTrack], events: list[Event]) -> None:
+    """Add the tracks and events of bodies, or of holes."""
+    last, names = None, list[int]()
+    for time, one in enumerate(parts):
+        labels = one.labels(of)
+        measured = _measures(labels, one.grid)
+        given: dict[int, int] = {}
+        if last is not None:
+            for old, new in _groups(_edges(last[0], labels, (last[1], measured))):
+                before, after = tuple(names[i] for i in old), new
+                if len(old) == len(new) == 1:
+                    given[new[0]] = before[0]
+                    continue
+                for j in after:
+                    given[j] = len(tracks)
+                    tracks.append(PartTrack(len(tracks), of, time, time, before, []))
+                centres = measured[0][list(new)] if new else last[1][0][list(old)]
+                place = tuple(float(value) for value in centres.mean(axis=0))
+                told = tuple(given[j] for j in after)
+                events.append(Event(time - 1, time, _kind(of, len(old), len(new)), of, before, told, place))
+        else:
+            for j in range(len(measured[1])):
+                given[j] = len(tracks)
+                tracks.append(PartTrack(len(tracks), of, time, time, (), []))
+        names = [given[j] for j in range(len(measured[1]))]
+        for name, volume in zip(names, measured[1]):
+            tracks[name].last = time
+            tracks[name].volumes.append(float(volume))
+        last = labels, measured
+
+
+def _kind(
+    of: Of, old: int, new: int
+) -> Literal["merger", "split", "appearance", "disappearance", "collapse", "rearrangement"]:
+    if not old:
+        return "appearance"
+    if not new:
+        return "collapse" if of == "hole" else "disappearance"
+    return "merger" if new == 1 else "split" if old == 1 else "rearrangement"
+
+
+def _groups(edges: np.ndarray) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
+    """Which parts before and now hang together, by edges [K, L]."""
+    from scipy.sparse import block_array, csr_array
+    from scipy.sparse.csgraph import connected_components
+
+    k, n = edges.shape
+    if not k + n:
+        return []
+    both = block_array([[csr_array((k, k)), csr_array(edges.astype(float))], [None, csr_array((n, n))]])
+    count, group = connected_components(both, directed=False)
+    return [
+        (tuple(np.flatnonzero(group[:k] == g).tolist()), tuple(np.flatnonzero(group[k:] == g).tolist()))
+        for g in range(count)
+    ]
+
+
+@dataclass(frozen=True)
+class Front:
+    """A spherical front in a volume. centre: `(x, y, z)` m; radius: [m]; step: δ just inside less that outside; errors:
+    [5] standard errors of centre, radius and step"""
+
+    centre: np.ndarray
+    radius: float
+    step: float
+    errors: np.ndarray
+
+    @classmethod
+    def of(cls, volume: Volume, seed: int = 0) -> Front:
+        """The spherical front that runs from the middle of the matter.
+
+        The radial mean shows where; then centre, radius, step, slope behind it, level before it and width are fitted to
+        the voxels of a shell by least squares. Eighths of the directions left out in turn (jackknife) give the errors,
+        since errors of neighbouring voxels go together. Errors: `InputError` where nothing is in the volume.
+        """
+        unit = float(min(volume.grid.voxel_size))
+        x, y, z = (axis / unit for axis in volume.grid.axes())
+        places = np.stack(np.meshgrid(z, y, x, indexing="ij"), axis=-1).reshape(-1, 3)[:, ::-1]
+        values = volume.delta.ravel() / float(np.abs(volume.delta).max(initial=1e-30))
+        require(bool(values.any()), "a front needs matter that changes, but the volume is empty; check the run.")
+        centre = np.average(places, axis=0, weights=values**2)
+        numbers = np.array([*centre, _jump(places - centre, values), 0.0, 0.0, 0.0, 0.7])
+        random = np.random.default_rng(seed)
+        for _ in range(3):
+            away = np.linalg.norm(places - numbers[:3], axis=1)
+            shell = np.flatnonzero(np.abs(away - numbers[3]) < max(SHELL * numbers[3], THINNEST))
+            chosen = shell if len(shell) <= MOST_FITTED else random.choice(shell, MOST_FITTED, replace=False)
+            numbers = _fitted(places[chosen], values[chosen], numbers)
+        octant = (places[chosen] > numbers[:3]) @ np.array([1, 2, 4])
+        kept = [_fitted(places[chosen][octant != k], values[chosen][octant != k], numbers) for k in range(8)]
+        errors = np.sqrt(7 * np.var(np.array(kept)[:, :5], axis=0))
+        scale = np.array([unit] * 4 + [float(np.abs(volume.delta).max())])
+        found = numbers[:5] * scale
+        return cls(found[:3], float(found[3]), float(found[4]), errors * scale)
+
+
+def _jump(places: np.ndarray, values: np.ndarray) -> float:
+    """Radius at which the radial mean of values about the middle of `places` [N, 3] jumps by most, in units of the
+    scatter of all that is farther out: a front runs into what is even."""
+    ring = np.linalg.norm(places, axis=1).astype(int)
+    last = max(5, int(np.abs(places).max()))  # beyond it directions are missing
+    count, total, square = (np.bincount(ring, weight, last + 1)[: last + 1] for weight in (None, values, values**2))
+    mean = total / np.maximum(count, 1)
+    far = [np.cumsum(part[::-1])[::-1] for part in (count, total, square)]
+    scatter = np.sqrt(np.maximum(far[2] / far[0] - (far[1] / far[0]) ** 2, 1e-12))
+    radii = np.arange(2, last - 1)
+    inside, beyond = (np.array([mean[r + a : r + a + 2].mean() for r in radii]) for a in (-2, 1))
+    return float(radii[(np.abs(inside - beyond) * radii / scatter[radii + 1]).argmax()])
+
+
+def _fitted(places: np.ndarray, values: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Centre, radius, step, slope, level, width that fit best."""
+
+    def shape(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        depth = numbers[3] - np.linalg.norm(places - numbers[:3], axis=1)
+        return depth, ndtr(depth / numbers[4])
+
+    def missed(curved: np.ndarray) -> np.ndarray:
+        depth, step = shape(curved)
+        design = np.stack([step, step * depth, np.ones_like(step)], axis=1)
+        return design @ np.linalg.lstsq(design, values, rcond=None)[0] - values
+
+    first, radius = start[[0, 1, 2, 3, 7]], start[3]
+    reach = np.array([0.5 * radius] * 4 + [np.inf])
+    low, high = first - reach, first + reach
+    low[4], high[4] = NARROWEST, max(radius, 2 * NARROWEST)
+    found = least_squares(missed, np.clip(first, low, high), bounds=(low, high)).x
+    depth, step = shape(found)
+    design = np.stack([step, step * depth, np.ones_like(step)], axis=1)
+    linear = np.linalg.lstsq(design, values, rcond=None)[0]
+    return np.array([*found[:4], *linear, found[4]])
+
+
+def front_rows(numbers: Sequence[int], times: Sequence[float], fronts: Sequence[Front]) -> Iterable[list[object]]:
+    """Rows of `FRONT_COLUMNS`. The speed is that of a polynomial of time through the radii, of the degree, up to two,
+    that predicts those left out; its error follows from their scatter about it."""
+    radii, when = np.array([front.radius for front in fronts]), np.asarray(times, dtype=np.float64)
+    speeds = np.full((len(fronts), 2), np.nan)
+    if len(fronts) > 2:
+        scaled = (when - when[0]) / (when[-1] - when[0])
+        degree = max(1, path_degree(scaled, radii[:, None], 2))
+        design = np.vander(scaled, degree + 1)
+        slope = np.stack([k * scaled ** max(k - 1, 0) for k in range(degree, -1, -1)], axis=1) / (when[-1] - when[0])
+        inverse = np.linalg.pinv(design)
+        left = radii - design @ (inverse @ radii)
+        variance = float(left @ left) / max(len(left) - degree - 1, 1)
+        speeds = np.stack(
+            [slope @ (inverse @ radii), np.sqrt(variance * np.square(slope @ inverse).sum(axis=1))], axis=1
+        )
+    for number, time, front, speed in zip(numbers, when, fronts, speeds):
+        told = [*front.centre, front.radius, front.errors[3], front.step, front.errors[4], *speed]
+        yield [number, f"{time:.9g}", *(f"{value:.6g}" for value in told)]

@@ -1,0 +1,135 @@
+"""Events of bodies and holes between times: on volumes of known topology, and a series of two drops that merge."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+
+import numpy as np
+import pytest
+
+from holosplat.checks import InputError
+from holosplat.geometry import Grid
+from holosplat.matter import Matter
+from holosplat.representations import VoxelGrid
+from holosplat.series.collect import collect
+from holosplat.series.events import FRONT_COLUMNS, PARTS, Front, History, Parts, front_rows
+from holosplat.series.folder import SeriesFolder
+from holosplat.volume import Volume
+
+GRID = Grid.centred((31, 25, 37), 0.5e-6, (1e-6, 0.0, 0.0))
+DELTA = 4e-7
+
+
+def parts(*balls: tuple[float, float, float, float], hole: float = 0.0) -> Parts:
+    """Of balls (x, y, z, radius) in voxels from the middle; hole: radius of one in the first of them."""
+    import torch
+
+    z, y, x = np.meshgrid(*(np.arange(n) - n // 2 for n in GRID.shape), indexing="ij")
+    full = np.zeros(GRID.shape, dtype=bool)
+    for cx, cy, cz, radius in balls:
+        full |= (x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2 < radius**2
+    if hole:
+        cx, cy, cz, _ = balls[0]
+        full &= (x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2 >= hole**2
+    values = torch.from_numpy(full[None].astype(np.float32))
+    return Parts.of(VoxelGrid(values, GRID, Matter.one(DELTA, 1e-9)), GRID)
+
+
+def told(history: History) -> list[tuple]:
+    return [(e.kind, e.of, e.first, e.before, e.after) for e in history.events]
+
+
+def test_two_bodies_merge_and_part_again():
+    apart, near = [(-9, 0, 0, 5), (9, 0, 0, 5)], [(-4, 0, 0, 5), (4, 0, 0, 5)]
+    history = History.of([parts(*apart), parts(*apart), parts(*near), parts(*near), parts(*apart)])
+    assert told(history) == [("merger", "body", 1, (0, 1), (2,)), ("split", "body", 3, (2,), (3, 4))]
+    assert [track.parents for track in history.tracks] == [(), (), (0, 1), (2,), (2,)]
+    assert [(track.first, track.last) for track in history.tracks] == [(0, 1), (0, 1), (2, 3), (4, 4), (4, 4)]
+    assert history.events[0].place == pytest.approx((1e-6, 0, 0), abs=1e-9)
+    ball = 4 / 3 * np.pi * (5 * 0.5e-6) ** 3
+    assert history.tracks[0].volumes[0] == pytest.approx(ball, rel=0.05)
+    assert history.lines([0.0, 1.0, 2.0, 3.0, 4.0])[0] == "merger between 1 and 2 s: bodies 0 and 1 → 2"
+
+
+def test_bodies_appear_and_vanish_and_a_hole_collapses():
+    history = History.of([parts((-8, 0, 0, 7), hole=3), parts((-8, 0, 0, 7), (10, 0, 0, 5)), parts((-8, 0, 0, 7))])
+    assert sorted(told(history)) == [
+        ("appearance", "body", 0, (), (1,)),
+        ("collapse", "hole", 0, (2,), ()),
+        ("disappearance", "body", 1, (1,), ()),
+    ]
+
+
+def test_a_body_that_leaps_by_less_than_its_radius_goes_on():
+    """And small parts are noise: neither bodies nor holes."""
+    history = History.of([parts((k, 0, 0, 5), (-13, 5, -9, 1.5)) for k in (-12, -8, 2, 6, 10)])
+    assert told(history) == [("disappearance", "body", 1, (0,), ()), ("appearance", "body", 1, (), (1,))]
+    assert not told(History.of([parts((k, 0, 0, 7), hole=1.2) for k in (-3, 0, 3)]))
+    assert History.of([]) == History((), ())
+    assert not told(History.of([parts(), parts()]))
+
+
+def test_parts_go_through_a_file(tmp_path):
+    one = parts((-8, 0, 0, 7), (9, 0, 0, 4), hole=3)
+    one.write(tmp_path / PARTS)
+    other = Parts.read(tmp_path / PARTS)
+    assert other.grid == one.grid
+    assert np.array_equal(other.bodies, one.bodies)
+    assert np.array_equal(other.holes, one.holes)
+    (tmp_path / PARTS).write_bytes(b"no archive")
+    with pytest.raises(InputError, match=r"parts\.npz"):
+        Parts.read(tmp_path / PARTS)
+
+
+def test_a_series_writes_its_events(done, tmp_path):
+    """Two cells that move on: two tracks, no event; the page has a section of events where there are some."""
+    shutil.copytree(done.path, tmp_path / "series")
+    folder = SeriesFolder(tmp_path / "series")
+    collect(folder, fronts=True)
+    assert len(folder.fronts.read_text().splitlines()) == 6
+    tracks = list(csv.DictReader(folder.tracks.read_text().splitlines()))
+    assert [(row["of"], row["first"], row["last"], row["parents"]) for row in tracks] == [("body", "0", "4", "")] * 2
+    assert folder.events.read_text().startswith("first,last,first_s,last_s,event,of,before,after")
+    assert 'id="events"' not in folder.page.read_text()
+    path = folder.run(1, 3) / PARTS
+    seen = Parts.read(path)
+    Parts(np.where(seen.bodies == 2, 0, seen.bodies), seen.holes, seen.grid).write(path)
+    collect(folder)
+    events = list(csv.DictReader(folder.events.read_text().splitlines()))
+    assert [(row["event"], row["first_s"], row["last_s"]) for row in events] == [
+        ("disappearance", "1", "1.5"),
+        ("appearance", "1.5", "2"),
+    ]
+    assert "disappearance between 1 and 1.5 s" in folder.page.read_text()
+
+
+def shock(radius: float, noise: float = 0.0) -> Volume:
+    """A front of that many voxels about (1, -2, 0.5), compressed behind it, rarefied in the middle, in noise."""
+    z, y, x = np.meshgrid(*(np.arange(n) - 0.5 * (n - 1) for n in GRID.shape), indexing="ij")
+    away = np.sqrt((x - 1) ** 2 + (y + 2) ** 2 + (z - 0.5) ** 2)
+    values = np.clip(radius - away + 0.5, 0, 1) * (1 - 0.12 * (radius - away)) - 3 * (away < 2.5)
+    values = values + noise * np.random.default_rng(0).normal(size=values.shape)
+    return Volume(DELTA * values, 0 * values, GRID)
+
+
+def test_a_front_is_found_with_radius_step_and_errors():
+    """To a tenth of a voxel, in noise of a fifth of its step, beside a stronger jump in its middle."""
+    found = Front.of(shock(8.3, noise=0.2))
+    assert found.radius == pytest.approx(8.3 * 0.5e-6, abs=0.1 * 0.5e-6)
+    assert found.step == pytest.approx(DELTA, rel=0.1)
+    middle = np.array(GRID.origin) + 0.5e-6 * (0.5 * (np.array(GRID.shape[::-1]) - 1) + [1, -2, 0.5])
+    assert found.centre == pytest.approx(middle, abs=0.1 * 0.5e-6)
+    assert 0 < found.errors[3] < 0.1 * 0.5e-6
+    assert abs(found.radius - 8.3 * 0.5e-6) < 4 * found.errors[3]
+    with pytest.raises(InputError, match="a front needs matter"):
+        Front.of(Volume(np.zeros(GRID.shape), np.zeros(GRID.shape), GRID))
+
+
+def test_a_front_runs_at_a_speed_with_its_error():
+    radii, times = [6.0, 6.8, 7.6, 8.4, 9.2, 10.0], 1e-6 * np.arange(6)
+    rows = list(front_rows(range(6), times.tolist(), [Front.of(shock(radius, noise=0.05)) for radius in radii]))
+    assert len(rows[0]) == len(FRONT_COLUMNS)
+    for row in rows:
+        assert float(str(row[9])) == pytest.approx(0.4, abs=0.03)  # 0.8 voxels of 0.5 µm a µs
+        assert 0 < float(str(row[10])) < 0.03
