@@ -23,6 +23,7 @@ from rows import read, write
 
 from holosplat.io import read_scan
 from holosplat.io.json import read_json
+from holosplat.matter import MatterKind
 from holosplat.methods import Auto
 from holosplat.planning.needs import Sizes, of_reconstruction
 from holosplat.planning.scan_facts import seen_of
@@ -75,7 +76,8 @@ def _cells(folder: Path) -> list[object]:
 def compared(scan: Path, told: tuple[str, ...]) -> dict[str, int]:
     """What a run is said to take."""
     train = read_scan(scan).train()
-    said = of_reconstruction(Sizes.of(train.exposures), Auto(), "levels" if told else None, seen_of(train, Auto()))
+    kind: MatterKind | None = "levels" if told else None
+    said = of_reconstruction(Sizes.of(train.exposures), Auto(), kind, seen_of(train, Auto()), bool(told))
     assert said is not None
     ends = {"least_mb": (said.least_memory or said.memory) / 1e6, "most_mb": said.memory / 1e6}
     ends |= {"least_s": said.seconds, "most_s": said.most_seconds or said.seconds}
