@@ -121,7 +121,9 @@ def test_only_surfaces_take_turns():
     sizes = Sizes.of(scan_of_one(48, 3.2e-6).exposures)
     for method, kind in ((METHODS["gaussians"], "levels"), (Auto(), "continuous")):
         said = of_reconstruction(sizes, method, kind, Seen(noisy=True))  # type: ignore[arg-type]
-        assert said == of_reconstruction(sizes, method, kind)  # type: ignore[arg-type]
+        plain = of_reconstruction(sizes, method, kind)  # type: ignore[arg-type]
+        assert said == replace(plain, most_seconds=said.most_seconds)
+        assert said.most_seconds <= plain.most_seconds  # trial fits have no rounds of agreement in noise
 
 
 def test_there_is_something_to_compare_with():

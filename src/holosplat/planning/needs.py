@@ -206,7 +206,7 @@ def of_reconstruction(
     if not each:
         return None
     worked, first = seen.windows or sizes, max(each, key=lambda one: one.memory)
-    decided = of_choice(worked, method) if isinstance(method, Auto) else 0.0
+    decided = of_choice(worked, _without_rounds(method) if seen.noisy else method) if isinstance(method, Auto) else 0.0
     decided += of_ratio(worked) if not ratio_told and isinstance(method, Auto | SmoothVolume) else 0.0
     least = min(one.least_memory or one.memory for one in each) if len(each) > 1 else first.least_memory
     most = max(one.most_seconds or one.seconds for one in each) + decided
@@ -338,7 +338,8 @@ def _bodies(sizes: Sizes, how: Gaussians, edges: bool) -> Needs:
     waves = max(Costs.waves * fitted, Costs.edges * sizes.waves(1) if edges else 0.0)
     begun = 0.0 if how.start == "random" else of_start(sizes, how.volume)
     count = how.random_count if how.start == "random" else min(how.max_start, how.start_per_pixel * sizes.pixels)
-    memory, seconds = max(begun, waves + Costs.gaussian * count), _gaussian_seconds(_work(sizes, how.volume), edges)
+    work = _work(sizes, how.volume) if how.volume.corrections or not edges else 0.0
+    memory, seconds = max(begun, waves + Costs.gaussian * count), _gaussian_seconds(work, edges)
     plain, finer = Needs(memory, 14 * count, seconds), sizes.waves(1)
     steps = how.coarse.of_views(sizes.views)
     near = Costs.near + (steps.coarse_steps + steps.last_steps) * (Costs.step + Costs.edge * finer)
