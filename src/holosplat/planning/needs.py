@@ -245,7 +245,7 @@ def of_choice(sizes: Sizes, method: Auto) -> float:
 
 
 def of_ratio(sizes: Sizes) -> float:
-    """Seconds in which volumes of coarse frames tell δ/β (`methods.uncertain`)."""
+    """Seconds for δ/β, which is fitted to coarse frames (`methods.uncertain`)."""
     coarse = _coarse(sizes)
     return RATIOS * (Costs.ratio + Costs.ratio_voxel * coarse.views * coarse.voxels)
 
