@@ -2,11 +2,12 @@
 
 python benchmarks/faults.py --trials 200 --csv docs/data/faults.csv
 
-Each trial is one command (or two: the next one), counted as a traceback, a hang (more than 60 s and, where it is
-killed, ten times what it takes undisturbed), a crash (a signal that nobody sent), a wrong result taken silently, a file
-torn (half of it is left), something lost (a file that was whole before and is no more, or a folder that no next command
-takes), or values of another file let in without leave. Trials are drawn from the seed, and repeat with it but for
-moments of a kill by time; by turns a kill is before a change of files, whose number is drawn.
+Each trial is one command (or two: the next one), counted as a traceback, a hang (more than 60 s of a processor, ten
+times as long of waiting and, where it is killed, ten times what it takes undisturbed), a crash (a signal that nobody
+sent), a wrong result taken silently, a file torn (half of it is left), something lost (a file that was whole before and
+is no more, or a folder that no next command takes), or values of another file let in without leave. Trials are drawn
+from the seed, and repeat with it but for moments of a kill by time; by turns a kill is before a change of files, whose
+number is drawn.
 """
 
 from __future__ import annotations

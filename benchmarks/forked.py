@@ -31,7 +31,7 @@ class Ended:
         """A traceback, a hang or a crash; empty for a command that worked, or ended with a sentence."""
         if "Traceback (most recent call last)" in self.said:
             return "traceback"
-        if self.signal == signal.SIGALRM:
+        if self.signal in (signal.SIGALRM, signal.SIGPROF):
             return "hang"
         return "crash" if self.code is None and self.signal != signal.SIGKILL else ""
 
@@ -60,6 +60,10 @@ def at_events(folder: Path, act: Callable[[int], None]) -> None:
     sys.addaudithook(heard)
 
 
+WAITS = 10
+"""Seconds that a command may wait for each of processor time: what else a machine does is no fault of it."""
+
+
 def run(
     arguments: list[object],
     kill_after: float = 0.0,
@@ -70,8 +74,8 @@ def run(
     """A command, with everything it says.
 
     kill_after: seconds after which it is killed (0: never), as by a power cut of the process; file_size: bytes beyond
-    which no file grows (-1: any), as on a full disk; limit: seconds after which it counts as hanging; first: what its
-    process does before the command begins.
+    which no file grows (-1: any), as on a full disk; limit: seconds of processor time after which it counts as hanging,
+    or `WAITS` times as many of waiting; first: what its process does before the command begins.
     """
 
     def act() -> None:
@@ -120,8 +124,12 @@ def _become(act: Callable[[], None], writing: int, limit: float) -> None:
         os.dup2(writing, 1)
         os.dup2(writing, 2)
         sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w")
-        signal.signal(signal.SIGALRM, signal.SIG_DFL)
-        signal.setitimer(signal.ITIMER_REAL, limit)
+        for alarm, timer, seconds in (
+            (signal.SIGPROF, signal.ITIMER_PROF, limit),
+            (signal.SIGALRM, signal.ITIMER_REAL, WAITS * limit),
+        ):
+            signal.signal(alarm, signal.SIG_DFL)
+            signal.setitimer(timer, seconds)
         code = _code(act)
         sys.stdout.flush()
         sys.stderr.flush()

@@ -27,7 +27,8 @@ from holosplat.geometry import Views
 from holosplat.io.vtk import write_mesh
 from holosplat.methods import METHODS
 from holosplat.optics.sampling import resolving_oversample
-from holosplat.planning.needs import Sizes, of_reconstruction, of_simulation
+from holosplat.planning.acts import of_simulation
+from holosplat.planning.needs import Sizes, of_reconstruction
 from holosplat.scan import Exposures
 from holosplat.specimens.red_cells import random_cells
 

@@ -1,7 +1,7 @@
 """What whole runs are said to take beside what they take: `holosplat info`'s estimates against processor time and peak
 memory of `reconstruct` in a process of its own. The estimates were mended by these scans: choose others to judge them.
 
-python benchmarks/needs_runs.py --csv docs/data/needs_runs.csv [--scans single narrow]
+python benchmarks/needs_runs.py --csv docs/data/needs_runs.csv [--scans single noisy] [--again]
 
 Estimates are ranges where the frames decide between ways. Wanted: no more than a factor of 1.5 beyond a range. Other
 programs beside it make processor time longer.
@@ -23,6 +23,7 @@ from rows import read, write
 
 from holosplat.io import read_scan
 from holosplat.io.json import read_json
+from holosplat.matter import MatterKind
 from holosplat.methods import Auto
 from holosplat.planning.needs import Sizes, of_reconstruction
 from holosplat.planning.scan_facts import seen_of
@@ -46,8 +47,8 @@ SCANS: dict[str, tuple[tuple[object, ...], tuple[str, ...]]] = {
 LIKE_CELLS = ("cells", "single", "noisy")
 
 
-def row(name: str) -> dict[str, object]:
-    """What a run is said to take, and takes [MB, s]."""
+def row(name: str, measured: dict[str, object] | None = None) -> dict[str, object]:
+    """What a run is said to take, and takes [MB, s], if that is not `measured`."""
     beam, told = SCANS[name]
     with tempfile.TemporaryDirectory() as folder:
         scan, out = Path(folder) / "scan.nxs", Path(folder) / "run"
@@ -56,14 +57,16 @@ def row(name: str) -> dict[str, object]:
         if ended.code != 0:
             raise SystemExit(ended.said)
         said = compared(scan, told)
+        if measured is not None:
+            return measured | said
         began = resource.getrusage(resource.RUSAGE_CHILDREN)
         memory = peak(["reconstruct", scan, "--out", out, *told])
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         seconds = after.ru_utime + after.ru_stime - began.ru_utime - began.ru_stime
         kind = read_json(out / "summary.json")["kind"]
-    measured = {"result": kind, "measured_mb": round(memory / 1e6), "measured_s": round(seconds)}
+    found = {"result": kind, "measured_mb": round(memory / 1e6), "measured_s": round(seconds)}
     machine_ = {"machine": f"{os.cpu_count()} × {platform.machine()}, shared", "commit": machine.commit()}
-    return {"scan": name} | said | measured | machine_
+    return {"scan": name} | said | found | machine_
 
 
 def _cells(folder: Path) -> list[object]:
@@ -75,7 +78,8 @@ def _cells(folder: Path) -> list[object]:
 def compared(scan: Path, told: tuple[str, ...]) -> dict[str, int]:
     """What a run is said to take."""
     train = read_scan(scan).train()
-    said = of_reconstruction(Sizes.of(train.exposures), Auto(), "levels" if told else None, seen_of(train, Auto()))
+    kind: MatterKind | None = "levels" if told else None
+    said = of_reconstruction(Sizes.of(train.exposures), Auto(), kind, seen_of(train, Auto()), bool(told))
     assert said is not None
     ends = {"least_mb": (said.least_memory or said.memory) / 1e6, "most_mb": said.memory / 1e6}
     ends |= {"least_s": said.seconds, "most_s": said.most_seconds or said.seconds}
@@ -87,12 +91,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--csv", type=Path, required=True)
     parser.add_argument("--scans", nargs="*", default=list(SCANS))
+    parser.add_argument("--again", action="store_true", help="estimates anew, beside the measurements of the table")
     given = parser.parse_args()
-    rows = [dict(one) for one in read(given.csv) if one["scan"] not in given.scans] if given.csv.exists() else []
+    rows = {str(one["scan"]): dict(one) for one in read(given.csv)} if given.csv.exists() else {}
     for name in given.scans:
-        rows.append(row(name))
-        print(rows[-1], flush=True)
-        write(rows, given.csv)
+        rows[name] = row(name, rows.get(name) if given.again else None)
+        print(rows[name], flush=True)
+        write(list(rows.values()), given.csv)
 
 
 if __name__ == "__main__":

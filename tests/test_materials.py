@@ -263,7 +263,8 @@ def test_material_table_that_is_not_there(tmp_path):
             (text, "CaSO6H4")
             for text in ("CaSO4.2H2O", "CaSO4 2H2O", "CaSO4·2H2O", "CaSO4*2H2O", "CaSO4 . 2 H2O", "CaSO4.2(H2O)")
         ),
-        *(("CaSO4.0.5H2O", "CaSO4.5H"), ("Na2CO3.10H2O", "Na2CO13H20"), ("Cu(NO3)2.3H2O", "CuN2O9H6")),
+        *((f"CaSO4{half}H2O", "CaSO4.5H") for half in (".0.5", "·0.5", " · 0.5 ", " 0.5", "·½", "×½")),
+        *(("Na2CO3.10H2O", "Na2CO13H20"), ("Cu(NO3)2.3H2O", "CuN2O9H6")),
         *(("MgSO4.7H2O.NaCl", "MgSO11H14NaCl"), ("CaSO₄·2H₂O", "CaSO6H4")),
         *(("NaCl.KCl", "NaCl2K"), ("YBa2Cu3O6.9", "YBa2Cu3O6.9"), ("Ba0.5Sr0.5TiO3", "BaSrTi2O6")),
     ],

@@ -31,7 +31,7 @@ NAMES = "a name that `holosplat materials` lists, such as water, plasma, soft ti
 WITH = "H2O|D2O|T2O|NH3|HCl|H2O2|CH3OH|CH4O|C2H5OH|C2H6O"
 """What crystals hold beside a salt: a point before a number of these joins them."""
 JOINT = re.compile(
-    rf"\s*[·•∙⋅*]\s*|\s*\.\s*(?=[A-Z(\[])|(?:\s*(?<!\.\d)\.\s*|\s+)(?=\d*\.?\d*\s*(?:{WITH}|\((?:{WITH})\))(?:$|[\s.·•∙⋅*]))(?<![.·•∙⋅*\s]\d\s)"
+    rf"\s*[·•∙⋅*×]\s*|\s*\.\s*(?=[A-Z(\[])|(?:\s*(?<![.·•∙⋅*×\s]\d)\.\s*|\s+)(?=\d*\.?\d*\s*(?:{WITH}|\((?:{WITH})\))(?:$|[\s.·•∙⋅*×]))(?<![.·•∙⋅*×\s]\d\s)"
 )
 """What joins the parts of a formula."""
 NUMBERED, ALONE = re.compile(r"(\d*\.?\d*)\s*(\S+)$"), re.compile(r"()([^\s\d]\S*)$")
@@ -43,7 +43,7 @@ MASSES = {
     **{"B10": 10.01294, "B11": 11.00931},
 }
 """Masses [u] of the isotopes that are farthest from their number of nucleons in proportion (Wang et al. 2021)."""
-WRONG = re.compile(r"[.·•∙⋅*\s]\d*\.?\d*\s*H20$|\.(?!\s*[\dA-Z(\[])")
+WRONG = re.compile(r"[.·•∙⋅*×\s]\d*\.?\d*\s*H20$|\.(?!\s*[\dA-Z(\[])")
 """Water with the digit 0, and points that nothing follows."""
 STAND_IN = "Lr"
 """An element beyond uranium, which stands for an isotope while its atoms are counted."""
@@ -66,7 +66,8 @@ def _atoms(formula: str) -> tuple[str, float]:
     before a number is one of decimals elsewhere (O6.9). Isotopes are D, T, and others as [13C]. Errors: `InputError`.
     """
     counts: dict[str, float] = {}
-    isotopes, formula = 0.0, unicodedata.normalize("NFKC", formula)  # H₂O as H2O
+    isotopes, formula = 0.0, unicodedata.normalize("NFKC", formula)  # H₂O as H2O, ½ as 1⁄2
+    formula = re.sub(r"([1-9])⁄([1-9])", lambda found: f"{int(found[1]) / int(found[2]):.9g}", formula)
     try:
         parts = re.split(JOINT, formula.strip())
         for part in parts:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from typing import TypeVar
 
 import numpy as np
@@ -135,3 +136,21 @@ def bar_length(width: float) -> float:
     target = 0.28 * width
     power = 10.0 ** math.floor(math.log10(target))
     return max(step * power for step in (1, 2, 5) if step * power <= target)
+
+
+def size_in_words(bytes_: float) -> str:
+    """`bytes_` in MB, or in GB to two digits."""
+    return f"{two_digits(bytes_ / 1e9)} GB" if bytes_ >= 0.95e9 else f"{max(1.0, bytes_ / 1e6):.0f} MB"
+
+
+def between(words: Callable[[float], str], least: float, most: float) -> str:
+    """A range of times or sizes in `words`; the first alone where there is no other."""
+    first, last = words(least), words(max(least, most))
+    return first if first == last else f"{first.removesuffix(last[last.index(' ') :])} to {last}"
+
+
+def time_in_words(seconds: float) -> str:
+    """In one unit, to about a digit."""
+    if seconds < 90:
+        return f"{max(1, round(seconds, -1)):.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

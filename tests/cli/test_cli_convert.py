@@ -126,6 +126,12 @@ def test_options_that_do_not_go_together(scan, tmp_path, arguments, message):
     assert not (tmp_path / "out").exists()
 
 
+def test_the_suffix_says_the_format(scan, tmp_path):
+    found = convert(scan, tmp_path / "out.nxs")
+    assert found.code in (0, None), found.said
+    np.testing.assert_array_equal(read_scan(tmp_path / "out.nxs").frames, read_scan(scan).frames)
+
+
 def test_nothing_is_overwritten_nor_guessed(scan, tmp_path):
     before = scan.read_bytes()
     again = convert(scan, scan, "--to", "nxtomo")

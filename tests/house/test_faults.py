@@ -6,6 +6,7 @@ import importlib
 import json
 import random
 import signal
+import time
 from pathlib import Path
 from types import ModuleType
 
@@ -180,6 +181,14 @@ def test_a_kill_comes_before_the_change_that_is_drawn(faults, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["one"]
 
 
+def test_a_machine_that_does_something_else_is_no_hang(faults):
+    """A command that took ten seconds of a processor was called hanging where twelve others ran."""
+    forked = importlib.import_module("forked")
+    assert forked.attempted(lambda: time.sleep(0.3), limit=0.1).code == 0
+    assert forked.attempted(lambda: time.sleep(9.0), limit=0.02).signal == signal.SIGALRM
+    assert forked.attempted(lambda: sum(iter(int, 1)), limit=0.1).signal == signal.SIGPROF
+
+
 @pytest.mark.parametrize(
     ("code", "by", "said", "verdict"),
     [
@@ -189,6 +198,7 @@ def test_a_kill_comes_before_the_change_that_is_drawn(faults, tmp_path):
         (1, 0, "", "traceback"),
         (None, signal.SIGSEGV, "", "crash"),
         (None, signal.SIGALRM, "", "hang"),
+        (None, signal.SIGPROF, "", "hang"),
     ],
 )
 def test_ends_are_told_apart(faults, code, by, said, verdict):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import tifffile
@@ -192,6 +193,7 @@ READ = {
     "files in another order": "file,angle\n"
     + "\n".join(f"a_{n + 7}.tif,{ANGLES[n]}" for n in (3, 1, 0, 2, 7, 6, 5, 4)),
     "degree signs": "\n".join(f"{angle}°" for angle in PLAIN),
+    "a column called by its unit": "n,rad\n" + "\n".join(f"{n},{a:.8f}" for n, a in enumerate(np.deg2rad(ANGLES))),
     "units in words": "\n".join(f"{angle:.8f} rad" for angle in np.deg2rad(ANGLES)),
     "semicolons and decimal commas": "Nr;Winkel\n"
     + "\n".join(f"{n};{a}".replace(".", ",") for n, a in enumerate(PLAIN)),
@@ -225,6 +227,9 @@ def test_angles_in_an_array_are_read(tmp_path):
         ("\n".join(angle.replace(".", ",") for angle in ("0.0", "22.5")), "with a point before the decimals"),
         ("\n".join(f"{n} {angle}" for n, angle in enumerate(PLAIN)), "a line holds 2 numbers"),
         ("\n".join(f"{angle:.0f}°30'" for angle in ANGLES), "must hold angles in degrees, but it holds"),
+        ("angle (arcmin)\n" + "\n".join(f"{60 * angle:g}" for angle in ANGLES), "unknown unit 'arcmin'"),
+        ("n,angle [turns]\n" + "\n".join(f"{n},{a / 360:g}" for n, a in enumerate(ANGLES)), "unknown unit 'turns'"),
+        ("phi,theta\n" + "\n".join(f"{n},{angle}" for n, angle in enumerate(PLAIN)), "names one column 'angle'"),
         ("\n".join(f"{angle} {'rad' if angle == '0' else 'deg'}" for angle in PLAIN), "angles of one unit"),
     ],
 )
@@ -247,6 +252,13 @@ def test_steps_of_more_than_a_turn_are_warned_of(tmp_path, caplog):
     (tmp_path / "scan" / "angles.txt").write_text("\n".join(f"{1000 * angle:g}" for angle in ANGLES))
     read_as(tmp_path / "scan", said())
     assert "angles go on by 22500 degrees, more than a turn each" in caplog.text
+    write_scan(tmp_path / "scan.nxs", a_scan())
+    with h5py.File(tmp_path / "scan.nxs", "r+") as file:
+        del file["entry/sample/view_rotation"]
+        file["entry/sample/rotation_angle"][...] *= 1000
+    caplog.clear()
+    read_as(tmp_path / "scan.nxs", Reading())
+    assert "rotation_angle: angles go on by 22500 degrees, more than a turn each" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -256,6 +268,7 @@ def test_steps_of_more_than_a_turn_are_warned_of(tmp_path, caplog):
         (np.deg2rad(ANGLES), None, "span 2.749 degrees only"),
         (2 * ANGLES, 3.5, ""),  # opposite frames complete each other
         (1.9 * ANGLES, 3.5, "axis is at column 3.5 of 24.*matter beyond it is cut off"),
+        (ANGLES, 20.5, "axis is at column 20.5 of 24.*matter beyond it is cut off"),
         (ANGLES, None, ""),
         (2 * ANGLES, 11.0, ""),
     ],

@@ -119,6 +119,13 @@ def test_labels_numbers_and_settings_read_well():
 def test_ends_of_values_that_are_rounding_are_zero():
     assert _ends(np.array([-4.9e-22, 7.4e-7])) == (0.0, 7.4e-7)
     assert _ends(np.array([-4.9e-9, 7.4e-7])) == (-4.9e-9, 7.4e-7)
+    shown = content()
+    inside = np.arange(shown.reconstruction.delta[0, 0].size) > 2
+    faint = np.where(inside, shown.reconstruction.delta, 1e-21)
+    found = replace(
+        shown, reconstruction=replace(shown.reconstruction, delta=faint), seen=np.broadcast_to(inside, faint.shape)
+    )
+    assert "Beyond it lies 0 % of the matter" in found.trust
     assert [duration(t) for t in (1.25, 54.2, 600, 3700)] == ["1.2 s", "54 s", "10 min 00 s", "1 h 01 min"]
 
 

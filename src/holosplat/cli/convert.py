@@ -11,7 +11,7 @@ import torch
 from tyro.conf import Positional, arg
 
 from ..checks import InputError, require
-from ..io.formats import ScanFormat, loader_of, read_as, read_volume_file
+from ..io.formats import HDF5_SUFFIXES, ScanFormat, loader_of, read_as, read_volume_file
 from ..io.images import TiffLayout, write_tiff
 from ..io.nerf_synthetic import NerfOptions, PngKind, grey_range, write_nerf_synthetic
 from ..io.nxtomo import write_scan
@@ -90,13 +90,14 @@ GOES_WITH: dict[str, tuple[ScanFormat, ...]] = {
     "material": ("nerf-synthetic", "r2-gaussian"),
 }
 """The formats that know an option."""
+NXTOMO = ".nxs"
 
 
 def convert(
     source: Annotated[Positional[Path], arg(metavar="SOURCE")],
     out: Annotated[Positional[Output], arg(metavar="OUT")],
-    to: ScanFormat,
     writing: WritingOptions,
+    to: ScanFormat | None = None,
     reading: Reading = Reading(),
     matter: PriorOptions = PriorOptions(),
     evening: EveningOptions = EveningOptions(),
@@ -106,8 +107,13 @@ def convert(
     Args:
         source: Scan, a file (NXtomo) or folder (nerf-synthetic, tiff, r2-gaussian, a run's).
         out: File (nxtomo) or folder to make.
-        to: Format to write; r2-gaussian needs a material or δ/β, for which its line integrals are retrieved.
+        to: Format to write (nxtomo where OUT ends with .nxs, .h5 or .hdf5); r2-gaussian needs a
+            material or δ/β, for which its line integrals are retrieved.
     """
+    if to is None:
+        named = out.suffix.lower() in (NXTOMO, *HDF5_SUFFIXES)
+        require(named, f"--to is required, for {out.name} says no format by its suffix ({NXTOMO} is nxtomo); add it.")
+        to = "nxtomo"
     said = writing.for_format(to)
     scan = _read(source, reading)
     prior = matter.prior(scan.exposures.reference_energy)

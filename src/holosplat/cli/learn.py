@@ -64,8 +64,7 @@ def dataset(
 def _needs(drawn: Ranges, scenes: int, jobs: int) -> Needs:
     """What so many scenes take."""
     from ..beamline.simulate import Simulation
-    from ..planning.acts import of_dataset
-    from ..planning.needs import of_simulation
+    from ..planning.acts import of_dataset, of_simulation
 
     views = drawn.views + drawn.held_out
     ends = (of_simulation(each, Simulation().samples(each), views) for each in drawn.extremes())

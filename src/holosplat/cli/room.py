@@ -28,7 +28,7 @@ def tell_reconstruction(
     if len(exposures) == 0:
         return  # there is nothing to fit, as the fit will say
     kind = matter or ("levels" if isinstance(prior, Known) else None)
-    needs = of_reconstruction(Sizes.of(exposures), method, kind, seen_of(scan, method, whole))
+    needs = of_reconstruction(Sizes.of(exposures), method, kind, seen_of(scan, method, whole), prior.fixes_ratio)
     if needs is not None:
         tell(method.kind, needs, out, smaller(exposures, method, kind))
 
@@ -48,7 +48,7 @@ def tell_each_time(exposures: Exposures, out: Path, method: Method, matter: Matt
 
 def tell_simulation(exposures: Exposures, out: Path, samples: int, frames: int) -> None:
     """The same for a simulation of `frames`, with so many wave samples along a pixel."""
-    from ..planning.needs import of_simulation
+    from ..planning.acts import of_simulation
 
     tell("the simulation", of_simulation(exposures, samples, frames), out)
 

@@ -22,7 +22,9 @@ if TYPE_CHECKING:
 
 UNIT = re.compile(rf"(?<![a-z])({'|'.join(sorted(ANGLE_UNITS, key=len, reverse=True))})s?(?![a-z])", re.IGNORECASE)
 WITH_UNIT = re.compile(rf"([-+.\deE]*\d\.?)\s*({UNIT.pattern})", re.IGNORECASE)
-NAME = re.compile(r"angle|theta|rotation|^rot(?![a-z])|^deg|omega|winkel", re.IGNORECASE)
+BRACKETED = re.compile(r"[\[(]\s*([^\W\d]+)\s*(?:[\])]|$)")
+"""A word of a header that stands where units do."""
+NAME = re.compile(r"angle|theta|rotation|^rot(?![a-z])|^deg|^rad|^phi(?![a-z])|omega|winkel", re.IGNORECASE)
 """Names of the column of angles."""
 LABELLED = re.compile(r"(?:angle|theta|rotation)\s*[:=]?\s*([-+]?\d[\d.]*(?:e[-+]?\d+)?)(.*)", re.IGNORECASE)
 """The angle in a line of a log, and what follows it."""
@@ -65,6 +67,8 @@ def read_angles(path: Path) -> np.ndarray:
     values = finite(f"{path}: angles", np.array([_number(path, word) for word, _ in parts]))
     if unit := UNIT.search(f"{units.pop()} {header} {said}".replace("_", " ")):
         return values * (unit_factor(f"{path}: angles", unit[1], ANGLE_UNITS) / ANGLE_UNITS["deg"])
+    if unknown := BRACKETED.search(header):
+        unit_factor(f"{path}: angles", unknown[1], ANGLE_UNITS)  # refuses it
     return degrees(str(path), values, "in a first line, '# radians' or '# degrees'")
 
 
@@ -179,11 +183,16 @@ def angles_of(views: Views) -> np.ndarray | None:
     return np.rad2deg(np.arctan2(rotations[:, 0, 2] - rotations[:, 2, 0], rotations[:, 0, 0] + rotations[:, 2, 2]))
 
 
-def tell_angles(angles_deg: np.ndarray, source: str) -> None:
-    """Say which range the angles [N] span, and where they are from; warn of steps that can hardly be meant."""
+def tell_steps(angles_deg: np.ndarray, source: str) -> None:
+    """Warn of angles [N] whose steps can hardly be meant."""
     steps = np.abs(np.diff(angles_deg))
     if len(steps) and np.median(steps) > WHOLE_TURN:
         warn(f"{source}: angles go on by {np.median(steps):.6g} degrees, more than a turn each; check their unit")
+
+
+def tell_angles(angles_deg: np.ndarray, source: str) -> None:
+    """Say which range the angles [N] span, and where they are from."""
+    tell_steps(angles_deg, source)
     note(f"{source}: {len(angles_deg)} angles from {angles_deg.min():.6g} to {angles_deg.max():.6g} degrees")
 
 
@@ -221,13 +230,11 @@ def _repeated(angles: np.ndarray) -> np.ndarray:
 
 
 def is_half_acquisition(scan: Scan) -> bool:
-    """Whether views turn by more than 180° about an axis far from the middle of their frames, which stays where it
-    is."""
+    """Whether views turn about an axis far from the middle of their frames, which stays where it is."""
     views, angles = scan.views, angles_of(scan.views)
     one = scan.exposures.has_one_energy and len(np.unique(scan.exposures.distance)) == 1
     if angles is None or len(views) < 2 or not one or not views.has_one_pixel or scan.is_series:
         return False
-    sides, shifts = np.sort(angles % 360), views.shifts / views.pixel_size
-    wide = 360 - float(np.diff([*sides, sides[0] + 360]).max())
+    shifts = views.shifts / views.pixel_size
     alike = np.allclose(shifts, shifts[:1], atol=1e-3)
-    return bool(wide > 180 and alike and abs(shifts[0, 0]) > OFF_CENTRE * views.shape[1])
+    return bool(alike and abs(shifts[0, 0]) > OFF_CENTRE * views.shape[1])

@@ -18,6 +18,7 @@ from ..checks import InputError, UnsaidError, finite, in_range, require, shaped,
 from ..geometry import Views, rotation_y
 from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, checked_distance
 from ..units import ANGLE_UNITS, BEAM_RANGE_KEV, ENERGY_UNITS, LENGTH_UNITS, PLANCK_TIMES_C_KEV_M, TIME_UNITS
+from .angles import tell_steps
 from .hdf5 import Fields, attribute_text, open_hdf5
 from .light import read_divided_light
 from .nxtomo_geometry import FLIPS as FLIPS
@@ -249,7 +250,9 @@ def _rotations_of_angles(fields: Fields, kinds: np.ndarray, given: Mapping[str, 
         if angles.any():
             most = np.abs(angles).max()
             warn(f"{fields.label(name)} has no @units: its angles, up to {most:.4g}, are taken as radians")
-    return rotation_y(np.rad2deg(angles * fields.unit(name, ANGLE_UNITS, "rad")))
+    angles_deg = np.rad2deg(angles * fields.unit(name, ANGLE_UNITS, "rad"))
+    tell_steps(angles_deg, fields.label(name))
+    return rotation_y(angles_deg)
 
 
 def _pixel_sizes(fields: Fields, kinds: np.ndarray) -> float | np.ndarray:

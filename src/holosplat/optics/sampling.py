@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -183,3 +184,13 @@ def alike(exposures: Exposures, oversample: int = 0) -> Iterator[np.ndarray]:
         rows, columns = sample.views.padded(padding(sample, finer)).refined(finer).shape
         at_once = max(1, MOST_SAMPLES // (rows * columns * len(same[0])))
         yield from (np.concatenate(same[i : i + at_once]) for i in range(0, len(same), at_once))
+
+
+def on_larger_pixels(exposures: Exposures, binning: int) -> Exposures:
+    """The same field on pixels `binning` times larger."""
+    if binning == 1:
+        return exposures
+    views = exposures.views
+    shape = (max(1, views.shape[0] // binning), max(1, views.shape[1] // binning))
+    views = replace(views, shape=shape, pitch=views.pitch * binning)
+    return replace(exposures, views=views, psf_sigma_px=exposures.psf_sigma_px / binning)

@@ -1,4 +1,4 @@
-"""Resource estimates of commands other than `reconstruct` and `simulate` of one time.
+"""Resource estimates of commands other than `reconstruct` of one time.
 
 `benchmarks/needs_acts.py` measures the memory that the constants below stand for, and writes docs/data/needs_acts.csv.
 Seconds and bytes on the disk are rough: they were measured once or twice, on a shared machine.
@@ -14,6 +14,7 @@ import numpy as np
 
 from ..io.ome import CHUNK, TIFF_SUFFIXES, ZARR_SUFFIX
 from ..io.volumes import SLAB_VOXELS
+from ..optics.sampling import padding
 from .needs import KEPT, Costs, Needs, Sizes, of_fit, of_start, with_report
 
 if TYPE_CHECKING:
@@ -84,6 +85,14 @@ class Room:
     """A pixel of a frame of a scene for learning."""
     scene_voxel: float = 0.05
     """A voxel of its occupancy."""
+
+
+def of_simulation(exposures: Exposures, samples: int, frames: int) -> Needs:
+    """What `simulate` takes: one view of waves at a time, and `frames` that are written. samples: along a pixel."""
+    margin = padding(exposures, samples)
+    rows, columns = (n + 2 * m for n, m in zip(exposures.views.shape, margin))
+    pixels = frames * math.prod(exposures.views.shape)
+    return Needs(Costs.program + Costs.simulated * rows * columns * samples**2, Costs.written * pixels + 1e6)
 
 
 def one_time(exposures: Exposures) -> Exposures:

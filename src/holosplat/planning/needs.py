@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -26,12 +26,13 @@ from ..methods import (
     SmoothVolume,
     Surfaces,
     Voxels,
+    uncertain,
 )
-from ..methods.first_volumes import FEWEST, MANY, MOST, WIDTH
+from ..methods.first_volumes import EFFORT, FEWEST, MANY, MOST, WIDTH
 from ..methods.start import MOST_GAUSSIANS
-from ..optics.sampling import fringe_sampling, padding
+from ..optics.sampling import fringe_sampling, on_larger_pixels, padding
 from ..scan import Exposures
-from ..units import two_digits
+from ..units import between, size_in_words, time_in_words
 
 KINDS: tuple[MatterKind, ...] = ("levels", "continuous")
 """Of matter, of which the frames may decide."""
@@ -88,12 +89,24 @@ class Costs:
     """Times what a fit of Gaussians takes: that, and the turns of surfaces and volume that may follow in noise."""
     beside: float = 12.0
     """Seconds of a run that a fit to coarse frames within it does not take: the program, judging and the report."""
+    near: float = 8.0
+    """The same where coarse pixels show the surfaces."""
+    step: float = 0.057
+    """Seconds of a step of such surfaces on any frames."""
+    edge: float = 1.53e-7
+    """The same for a wave sample."""
+    ratio: float = 0.2
+    """Seconds of a trial of δ/β."""
+    ratio_voxel: float = 1.6e-6
+    """The same for a voxel of coarse pixels in a view."""
 
 
 SAFETY = 1.1
 """Times the estimate that must be there: it errs by a fifth."""
 KEPT = 4
 """Copies of an object that a run folder may hold: itself, two checkpoints with their optimiser, one being written."""
+RATIOS = uncertain.MANY + 2 * (uncertain.NEWTON + 1)
+"""Trials of δ/β of which nothing is known."""
 FULL = 0.03
 """Share of a large field that is taken to be full of matter."""
 
@@ -138,16 +151,6 @@ class Sizes:
         return replace(self, rows=self.rows // factor, columns=self.columns // factor)
 
 
-def on_larger_pixels(exposures: Exposures, binning: int) -> Exposures:
-    """The same field on pixels `binning` times larger."""
-    if binning == 1:
-        return exposures
-    views = exposures.views
-    shape = (max(1, views.shape[0] // binning), max(1, views.shape[1] // binning))
-    views = replace(views, shape=shape, pitch=views.pitch * binning)
-    return replace(exposures, views=views, psf_sigma_px=exposures.psf_sigma_px / binning)
-
-
 @dataclass(frozen=True)
 class Needs:
     """Peak resources of a job: memory, at most, and disk [bytes], processor time of all cores together [s];
@@ -161,11 +164,11 @@ class Needs:
 
     def line(self) -> str:
         """In words."""
-        time = f", and about {_between(time_in_words, self.seconds, self.most_seconds)} of processor time" * (
+        time = f", and about {between(time_in_words, self.seconds, self.most_seconds)} of processor time" * (
             self.seconds > 0
         )
-        memory = _between(_size, self.least_memory or self.memory, self.memory)
-        return f"takes about {memory} of memory, {_size(self.disk)} on the disk{time}"
+        memory = between(size_in_words, self.least_memory or self.memory, self.memory)
+        return f"takes about {memory} of memory, {size_in_words(self.disk)} on the disk{time}"
 
     def times(self, count: int) -> Needs:
         """Resources of so many of the same, one after the other."""
@@ -190,19 +193,28 @@ UNSEEN = Seen()
 
 
 def of_reconstruction(
-    sizes: Sizes, method: Method, matter: MatterKind | None = None, seen: Seen = UNSEEN
+    sizes: Sizes, method: Method, matter: MatterKind | None = None, seen: Seen = UNSEEN, ratio_told: bool = True
 ) -> Needs | None:
     """Estimate resources of `reconstruct` for training frames of such sizes; None for a method without an estimate.
 
     matter: its kind, where that is settled; else the frames decide, and it takes what either kind takes.
+    ratio_told: whether δ/β is known. Fits to coarse frames may decide of light, matter and ratio: the longest time has
+    room for them.
     """
-    if isinstance(method, Auto) and matter is None:
-        each = [one for kind in KINDS if (one := of_reconstruction(sizes, method, kind, seen)) is not None]
-        times = [time for one in each for time in (one.seconds, one.most_seconds or one.seconds)]
-        least = min(one.least_memory or one.memory for one in each)
-        most = max(times) + of_choice(seen.windows or sizes, method)
-        largest = max(each, key=lambda one: one.memory)
-        return replace(largest, seconds=min(times), most_seconds=most, least_memory=least)
+    kinds = KINDS if isinstance(method, Auto) and matter is None else (matter,)
+    each = [one for kind in kinds if (one := _of_kind(sizes, method, kind, seen)) is not None]
+    if not each:
+        return None
+    worked, first = seen.windows or sizes, max(each, key=lambda one: one.memory)
+    decided = of_choice(worked, _without_rounds(method) if seen.noisy else method) if isinstance(method, Auto) else 0.0
+    decided += of_ratio(worked) if not ratio_told and isinstance(method, Auto | SmoothVolume) else 0.0
+    least = min(one.least_memory or one.memory for one in each) if len(each) > 1 else first.least_memory
+    most = max(one.most_seconds or one.seconds for one in each) + decided
+    return replace(first, seconds=min(one.seconds for one in each), most_seconds=most, least_memory=least)
+
+
+def _of_kind(sizes: Sizes, method: Method, matter: MatterKind | None, seen: Seen) -> Needs | None:
+    """The same for a kind of matter, without decisions."""
     worked = seen.windows or sizes
     fit = of_fit(worked, _without_rounds(method) if seen.noisy else method, matter)
     if fit is None:
@@ -215,16 +227,27 @@ def of_reconstruction(
     return replace(fit, memory=with_report(sizes, fit.memory), least_memory=least)
 
 
+def _coarse(sizes: Sizes) -> Sizes:
+    """Those of the coarse frames by which is decided."""
+    factor = math.ceil(max(sizes.rows, sizes.columns) / WIDTH)
+    rows, columns = (max(1, n // factor) for n in (sizes.rows, sizes.columns))
+    return replace(sizes, rows=rows, columns=columns, samples=factor * sizes.samples)
+
+
 def of_choice(sizes: Sizes, method: Auto) -> float:
     """Seconds, at most, in which fits of both kinds to coarse frames decide, where first volumes do not
-    (`methods.levels`)."""
+    (`methods.illumination`, `methods.levels`)."""
     if sizes.views < FEWEST:
         return 0.0
-    factor, folds = math.ceil(max(sizes.rows, sizes.columns) / WIDTH), MOST if sizes.views >= MANY else sizes.views
-    rows, columns = (max(1, n // factor) for n in (sizes.rows, sizes.columns))
-    coarse = replace(sizes, rows=rows, columns=columns, samples=factor * sizes.samples)
-    each = [of_fit(coarse, method, kind) for kind in KINDS]
-    return folds * sum(max(0.0, one.seconds - Costs.beside) for one in each if one is not None)
+    coarse, folds = _coarse(sizes), MOST if sizes.views >= MANY else sizes.views
+    each = [of_fit(coarse, method.with_effort(EFFORT), kind) for kind in KINDS]
+    return folds * sum(max(one.seconds, one.most_seconds) - Costs.beside for one in each if one is not None)
+
+
+def of_ratio(sizes: Sizes) -> float:
+    """Seconds for δ/β, which is fitted to coarse frames (`methods.uncertain`)."""
+    coarse = _coarse(sizes)
+    return RATIOS * (Costs.ratio + Costs.ratio_voxel * coarse.views * coarse.voxels)
 
 
 def _without_rounds(method: Method) -> Method:
@@ -315,14 +338,17 @@ def _bodies(sizes: Sizes, how: Gaussians, edges: bool) -> Needs:
     waves = max(Costs.waves * fitted, Costs.edges * sizes.waves(1) if edges else 0.0)
     begun = 0.0 if how.start == "random" else of_start(sizes, how.volume)
     count = how.random_count if how.start == "random" else min(how.max_start, how.start_per_pixel * sizes.pixels)
-    memory, seconds = max(begun, waves + Costs.gaussian * count), _gaussian_seconds(_work(sizes, how.volume), edges)
+    work = _work(sizes, how.volume) if how.volume.corrections or not edges else 0.0
+    memory, seconds = max(begun, waves + Costs.gaussian * count), _gaussian_seconds(work, edges)
     plain, finer = Needs(memory, 14 * count, seconds), sizes.waves(1)
-    near = 12 + 1.07e-5 * finer
+    steps = how.coarse.of_views(sizes.views)
+    near = Costs.near + (steps.coarse_steps + steps.last_steps) * (Costs.step + Costs.edge * finer)
     if how.start != "phase" or how.coarse.columns == 0:
         return plain
     if edges:
         least = max(of_start(sizes, replace(how.volume, corrections=0)), waves)
-        return replace(plain, seconds=near, most_seconds=max(near, seconds), least_memory=min(least, memory))
+        longest = near + max(0.0, seconds - Costs.beside)  # of both ways, one after the other
+        return replace(plain, seconds=near, most_seconds=longest, least_memory=min(least, memory))
     if how.coarse.factor((sizes.rows, sizes.columns)) == 1:
         return plain
     filled = min(MOST_GAUSSIANS, FULL * sizes.voxels)
@@ -356,38 +382,14 @@ def of_start(sizes: Sizes, how: HolographicTV) -> float:
     return max(alone, Costs.fine * fine + Costs.coarse * small.voxels + rays)
 
 
-def of_simulation(exposures: Exposures, samples: int, frames: int) -> Needs:
-    """What `simulate` takes: one view of waves at a time, and `frames` that are written. samples: along a pixel."""
-    margin = padding(exposures, samples)
-    rows, columns = (n + 2 * m for n, m in zip(exposures.views.shape, margin))
-    pixels = frames * math.prod(exposures.views.shape)
-    return Needs(Costs.program + Costs.simulated * rows * columns * samples**2, Costs.written * pixels + 1e6)
-
-
 def require_room(needs: Needs, path: Path, others: Iterable[tuple[str, Needs]] = ()) -> None:
     """`InputError` if a job does not fit into memory and disk, with the first of the `others` that does."""
     if needs.fit(path):
         return
     memory, disk = free_memory() + Costs.program, free_disk(path)
-    way = next((f"{how} takes {_size(one.memory)} and {_size(one.disk)}" for how, one in others if one.fit(path)), "")
+    fits = ((how, one) for how, one in others if one.fit(path))
+    way = next((f"{how} takes {size_in_words(one.memory)} and {size_in_words(one.disk)}" for how, one in fits), "")
     raise InputError(
-        f"the job {needs.line()}, but {_size(memory)} of memory and {_size(disk)} of disk are free; "
+        f"the job {needs.line()}, but {size_in_words(memory)} of memory and {size_in_words(disk)} of disk are free; "
         f"{way or 'take a part of it (of frames by --crop, --views), or a larger machine'}."
     )
-
-
-def _size(bytes_: float) -> str:
-    return f"{two_digits(bytes_ / 1e9)} GB" if bytes_ >= 0.95e9 else f"{max(1.0, bytes_ / 1e6):.0f} MB"
-
-
-def _between(words: Callable[[float], str], least: float, most: float) -> str:
-    """A range of times or sizes in `words`; the first alone where there is no other."""
-    first, last = words(least), words(max(least, most))
-    return first if first == last else f"{first.removesuffix(last[last.index(' ') :])} to {last}"
-
-
-def time_in_words(seconds: float) -> str:
-    """In one unit, to about a digit."""
-    if seconds < 90:
-        return f"{max(1, round(seconds, -1)):.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

@@ -30,7 +30,7 @@ from ..methods.gaussians import Gaussians
 from ..methods.window import windows_of
 from ..optics.noise import noise_levels, noise_share
 from ..optics.noise_model import NoiseModel
-from ..optics.sampling import fringes
+from ..optics.sampling import fringes, on_larger_pixels
 from ..scan import Exposures, Scan
 from ..units import beam_named, span
 from .acts import of_each_time
@@ -40,11 +40,8 @@ from .needs import (
     Needs,
     Seen,
     Sizes,
-    of_choice,
     of_reconstruction,
-    on_larger_pixels,
     require_room,
-    time_in_words,
 )
 
 FIELDS = 3
@@ -256,7 +253,7 @@ def _needs(scan: Scan, numbers: np.ndarray) -> dict[str, str]:
     windows = seen.windows and replace(seen.windows, views=len(train))
     rows = {}
     for kind, name in KINDS.items():
-        needs = of_reconstruction(Sizes.of(train.exposures), Auto(), kind, replace(seen, windows=windows))
+        needs = of_reconstruction(Sizes.of(train.exposures), Auto(), kind, replace(seen, windows=windows), False)
         if needs is None:
             continue
         try:
@@ -264,11 +261,6 @@ def _needs(scan: Scan, numbers: np.ndarray) -> dict[str, str]:
             rows[name] = needs.line()
         except InputError as error:  # says what would fit
             rows[name] = str(error)
-    choice = of_choice(windows or Sizes.of(train.exposures), Auto())
-    if choice:
-        rows["either"] = (
-            f"up to about {time_in_words(choice)} more, where fits decide between the two (--matter says it)"
-        )
     return rows
 
 

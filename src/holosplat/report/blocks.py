@@ -281,7 +281,7 @@ def _histograms(content: ReportContent) -> Block:
     elif outside is None:
         text += "β is zero in all matter, so δ\u2060/\u2060β is not defined. "
     else:
-        text += f"{100 * outside:.1f} % of the mass lies outside of the range drawn for δ\u2060/\u2060β. "
+        text += f"{in_percent(round(outside, 4))} of the mass lies outside of the range drawn for δ\u2060/\u2060β. "
         if content.truth is not None:
             text += "The truth's δ\u2060/\u2060β is the ratio of its mean δ to its mean β. "
     title = "Distribution of δ\u2060/\u2060β and of δ." if content.delta_told else f"Distribution of {shown.symbol}."

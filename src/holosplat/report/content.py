@@ -281,7 +281,7 @@ class ReportContent:
         share = float(size[~self.seen].sum(dtype=np.float64) / size.sum(dtype=np.float64))
         return (
             "Inside the dashed line all training views show the matter and its first fringe. Beyond it lies "
-            f"{in_percent(share)} of the matter; trust its values less."
+            f"{in_percent(round(share, 5))} of the matter; trust its values less."
         )
 
     @property

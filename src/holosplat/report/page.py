@@ -246,8 +246,8 @@ def _decisions_table(content: ReportContent) -> Table | None:
         return None
     rows = []
     for each in content.decisions:
-        tried = (f"{one.name}: {100 * one.gain:+.1f} ± {100 * one.error:.1f} %" for one in each.compared)
-        rows.append((each.name, each.choice, each.by, "; ".join(tried).replace("-", "−"), f"{each.seconds:.1f} s"))
+        tried = (f"{one.name}: {percent(one.gain)} ± {100 * one.error:.1f} %" for one in each.compared)
+        rows.append((each.name, each.choice, each.by, "; ".join(tried), f"{each.seconds:.1f}\u00a0s"))
     head = ("decision", "choice", "by", "smaller residual of unseen frames", "time")
     return Table("Decisions", rows, head)
 

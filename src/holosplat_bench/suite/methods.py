@@ -23,7 +23,8 @@ from holosplat.methods import (
 )
 from holosplat.methods.per_view import SVMBIR
 from holosplat.methods.presets import preset
-from holosplat.planning.needs import Costs, Needs, Sizes, of_fit, of_simulation
+from holosplat.planning.acts import of_simulation
+from holosplat.planning.needs import Costs, Needs, Sizes, of_fit
 from holosplat.scan import Exposures
 
 from ..opponents.photographs import AlphaSplats, RadianceFields
