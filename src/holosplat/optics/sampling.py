@@ -132,7 +132,8 @@ class SharedPoses:
         _, kind = np.unique(optics, axis=0, return_inverse=True)
         kind, pose = kind.reshape(-1), np.arange(len(exposures))
         least = 2 * (1 - np.cos(1 / max(views.shape)))  # 3 - trace of a turn of half a pixel at the edge
-        for same in (np.flatnonzero(kind == k) for k in np.unique(kind)):
+        order = np.argsort(kind, kind="stable")
+        for same in np.split(order, np.flatnonzero(np.diff(kind[order])) + 1):
             firsts: list[int] = []
             has: list[set[float]] = []
             for v in same.tolist():
