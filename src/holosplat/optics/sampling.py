@@ -128,24 +128,25 @@ class SharedPoses:
     @staticmethod
     def _poses(exposures: Exposures) -> np.ndarray:
         """The first frame of the pose of each [V]: the nearest pose that has none of its distance yet."""
-        views, turns = exposures.views, exposures.views.rotations
+        views, turns, distance = exposures.views, exposures.views.rotations, exposures.distance.tolist()
         optics = np.stack((views.relative, exposures.time, exposures.energy_kev), axis=1)
         _, kind = np.unique(optics, axis=0, return_inverse=True)
         kind, pose = kind.reshape(-1), np.arange(len(exposures))
         least = 2 * (1 - np.cos(1 / max(views.shape)))  # 3 - trace of a turn of half a pixel at the edge
-        for same in (np.flatnonzero(kind == k) for k in np.unique(kind)):
+        order = np.argsort(kind, kind="stable")
+        for same in np.split(order, np.flatnonzero(np.diff(kind[order])) + 1):
             firsts: list[int] = []
             has: list[set[float]] = []
             for v in same.tolist():
                 far = 3 - np.einsum("nij,ij->n", turns[firsts], turns[v])
-                far[[exposures.distance[v] in distances for distances in has]] = np.inf
+                far[[distance[v] in distances for distances in has]] = np.inf
                 n = int(far.argmin()) if firsts else 0
                 if firsts and far[n] < least:
                     pose[v] = firsts[n]
-                    has[n].add(exposures.distance[v])
+                    has[n].add(distance[v])
                 else:
                     firsts.append(v)
-                    has.append({exposures.distance[v]})
+                    has.append({distance[v]})
         return pose
 
     def sum(self, values: Tensor) -> Tensor:
