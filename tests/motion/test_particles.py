@@ -104,9 +104,9 @@ def test_paths_lead_on_with_intervals_that_hold():
     speeds = np.array([[1e-6, 6e-5 + 3e-6 * k, 1e-5] for k in range(8)])
     bend = np.array([0.0, 3e-7, 0.0])
     truth = starts + times[:, None, None] * speeds + times[:, None, None] ** 2 * bend
-    found = [[Particle(c + step * random.normal(size=3), 4e-5, step) for c in truth[t]] for t in range(24)]
+    found = [[Particle(c + step * random.normal(size=3), 4e-5, np.r_[step, 1e-6]) for c in truth[t]] for t in range(24)]
     for several in found:
-        several.append(Particle(random.uniform(-1e-3, 3e-3, 3), 2e-5, step))
+        several.append(Particle(random.uniform(-1e-3, 3e-3, 3), 2e-5, np.r_[step, 1e-6]))
     paths = link_particles(found, times[:24])
     assert len(paths) == 8
     inside = []

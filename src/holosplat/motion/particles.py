@@ -236,27 +236,30 @@ LINKS = LinkOptions(gate=4.0, change=0.7, gap=3, least=4)
 
 @dataclass(frozen=True)
 class ParticlePath:
-    """A particle through the times. times: [N] s at which it was seen; centres: [N, 3] m; radius: [m], the median;
-    degrees: of the polynomials of time of x, y and z"""
+    """A particle through the times. times: [N] s at which it was seen; centres, errors: [N, 3] m; radius: [m], the
+    median; degrees: of the polynomials of time of x, y and z"""
 
     times: np.ndarray
     centres: np.ndarray
+    errors: np.ndarray
     radius: float
     degrees: tuple[int, ...]
 
     def at(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Places [T, 3] m at `times` [T] s, also later ones, and the standard errors [T, 3] m of sightings there.
 
-        They are those of the polynomials' coefficients by the scatter about the path, and this scatter itself.
+        They are those of the polynomials' coefficients by the scatter about the path, and this scatter itself, of the
+        median sighting. Sightings count by their own errors: beyond the frame they are worth less.
         """
         first, span = self.times[0], self.times[-1] - self.times[0]
         places, errors = np.empty((len(times), 3)), np.empty((len(times), 3))
         for axis, degree in enumerate(self.degrees):
             known = np.vander((self.times - first) / span, degree + 1)
             asked = np.vander((np.asarray(times) - first) / span, degree + 1)
-            inverse = np.linalg.pinv(known)
-            found = inverse @ self.centres[:, axis]
-            left = self.centres[:, axis] - known @ found
+            weights = np.median(self.errors[:, axis]) / self.errors[:, axis]
+            inverse = np.linalg.pinv(weights[:, None] * known)
+            found = inverse @ (weights * self.centres[:, axis])
+            left = weights * (self.centres[:, axis] - known @ found)
             variance = float(left @ left) / max(len(left) - degree - 1, 1)
             places[:, axis] = asked @ found
             errors[:, axis] = np.sqrt(variance * (1 + np.square(asked @ inverse).sum(axis=1)))
@@ -278,8 +281,8 @@ def link_particles(
     for track in identified(seen, np.asarray(times), options):
         when = np.asarray(times)[[seen[k].time for k in track]]
         centres = np.array([flat[k][1].centre for k in track])
-        degrees = tuple(
-            path_degree((when - when[0]) / (when[-1] - when[0]), centres[:, [axis]], 2) for axis in range(3)
-        )
-        paths.append(ParticlePath(when, centres, float(np.median([flat[k][1].radius for k in track])), degrees))
+        own, scaled = np.array([flat[k][1].errors[:3] for k in track]), (when - when[0]) / (when[-1] - when[0])
+        degrees = tuple(path_degree(scaled, axis[:, None], 2, error) for axis, error in zip(centres.T, own.T))
+        radius = float(np.median([flat[k][1].radius for k in track]))
+        paths.append(ParticlePath(when, centres, own, radius, degrees))
     return paths

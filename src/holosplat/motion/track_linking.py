@@ -274,16 +274,20 @@ def _middle(
     return basis.fitted(dense, seen[best].centre + (dense - times[seen[best].time])[:, None] * velocity)
 
 
-def path_degree(when: np.ndarray, centres: np.ndarray, most: int) -> int:
+def path_degree(when: np.ndarray, centres: np.ndarray, most: int, errors: np.ndarray | None = None) -> int:
     """The degree, up to `most`, of the polynomial through `centres` [N, K] at times `when` [N], of order one, that
-    predicts those left out; the least is the null, and 0 stands for too few."""
+    predicts those left out; the least is the null, and 0 stands for too few.
+
+    errors: [N] standard errors of the centres (None: all are alike)
+    """
+    weights = np.ones(len(when)) if errors is None else 1 / errors
 
     def left_out(name: str, fold: int) -> Score:
         missed = []
         for k in range(len(when)):
             kept = np.arange(len(when)) != k
-            powers = np.polynomial.polynomial.polyfit(when[kept], centres[kept], int(name))
-            missed.append(centres[k] - np.polynomial.polynomial.polyval(when[k], powers))
+            powers = np.polynomial.polynomial.polyfit(when[kept], centres[kept], int(name), w=weights[kept])
+            missed.append(weights[k] * (centres[k] - np.polynomial.polynomial.polyval(when[k], powers)))
         return Score(np.square(missed).sum(axis=1)[:, None])
 
     degrees = [str(n) for n in range(most + 1) if len(when) > n + 1]
