@@ -18,8 +18,8 @@ XRAYS_KEV = (0.1, 400.0)
 """Energies [keV] that are said as such; light and electrons outside are said by their wavelength."""
 WAVELENGTH_RANGE_M = (1.24e-12, 1e-3)
 """From electrons of 600 kV to terahertz waves [m]."""
-BEAM_RANGE_KEV = (PLANCK_TIMES_C_KEV_M / WAVELENGTH_RANGE_M[1], 1000.0)
-"""The same as photon energies [keV]."""
+BEAM_RANGE_KEV = (1e-6, 1000.0)
+"""Photon energies [keV] among which they are."""
 
 PREFIXES = {"": 0, "kilo": 3, "deci": -1, "centi": -2, "milli": -3, "micro": -6, "nano": -9, "pico": -12}
 """Words before a unit, and their powers of ten."""

@@ -329,7 +329,7 @@ WRONG = [
     ),
     ('medium = "water"', 'medium = "C5H8O2"', "matter.medium: material 'C5H8O2' is a formula and needs its density"),
     ('medium = "water"', "medium = 3", "matter.medium must be a table, but it is 3"),
-    ("energy_kev = 15", "energy_kev = 15e3", "energy must lie between 0.1 and 1000 keV, but it is 15000"),
+    ("energy_kev = 15", "energy_kev = 15e3", "energy must lie between 1e-06 and 1000 keV, but it is 15000"),
     ("distance = 0.05", "distance = -1", "beam: distance must not be negative, but it is -1"),
     ("rows = 17", "rows = 0", "detector: rows must lie between 1 and 4096, but it is 0"),
     ("rows = 17", "rows = 9", r"mine \(seed 0\) must lie within the detector in every view, but it reaches"),
