@@ -261,10 +261,10 @@ def _middle(
     Beside the flow, it passes the middle of the best detection, whose surface it carries.
     """
     whole = [k for k in track if not seen[k].cut]
-    when, centres = times[[seen[k].time for k in whole]], np.array([seen[k].centre for k in whole])
+    when, centres = times[[seen[k].time for k in whole]], np.reshape([seen[k].centre for k in whole], (-1, 3))
     dense, velocity = np.linspace(basis.first, basis.last, 4 * basis.count), flow * (basis.degree > 0)
 
-    scale = basis.last - basis.first
+    scale = (basis.last - basis.first) or 1.0
     away = centres - (when - basis.first)[:, None] * velocity
     chosen = path_degree((when - basis.first) / scale, away, min(2, basis.degree))
     if chosen > 0:
