@@ -13,7 +13,8 @@ from helpers.kept import Kept
 from helpers.moving_ellipsoids import MATERIAL, PIXEL, TIMES, scan, true_paths
 from holosplat.fit import run as engine
 from holosplat.fit.schedule import Schedule
-from holosplat.motion import body_tracker, pieces
+from holosplat.motion import body_tracker
+from holosplat.motion import fit as path_fits
 from holosplat.motion.fit import PathOptions, motion_fit
 from holosplat.motion.measures import ASTRAY, astray, halves_of, standard_errors, tell_shapes
 from holosplat.motion.track import TrackOptions, follow
@@ -134,7 +135,7 @@ def test_fits_of_the_choice_of_paths_are_not_made_again(monkeypatch):
             raise KeyboardInterrupt
         return motion_fit(frames, start, *given)
 
-    monkeypatch.setattr(pieces, "motion_fit", fitted)
+    monkeypatch.setattr(path_fits, "motion_fit", fitted)
     with pytest.raises(KeyboardInterrupt):
         follow(scan(), MATERIAL, free, journal=(kept := Kept(every.states[: at + 1])))
     again = follow(scan(), MATERIAL, free, journal=kept)
