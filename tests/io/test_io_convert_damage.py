@@ -107,7 +107,7 @@ BAD_TABLES = [
     ("nerf", lambda table: table["frames"].pop(), "0 to 4, each once"),
     ("stack", put("format", "holosplat TIFF 2"), "must be 'holosplat TIFF 1'"),
     ("stack", take("energy_kev"), "energy_kev must be there"),
-    ("stack", put("energy_kev", 20000), "between 0.1 and 1000"),
+    ("stack", put("energy_kev", 20000), "between 1e-06 and 1000"),
     ("stack", put("pixel_size_m", "3 um"), "must hold numbers"),
     ("stack", lambda table: table["frames"].pop(), "must hold 4 pages"),
     ("stack", put("frames", []), "at least one frame"),
