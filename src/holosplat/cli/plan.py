@@ -59,10 +59,12 @@ class ObjectOptions:
 
     def subject(self) -> Subject:
         """The object that the options name."""
+        from ..materials import Transparent
         from ..planning.contrast import Subject
 
         filling = MaterialOptions(self.material, self.density, self.medium, self.medium_density).filling()
         assert filling.material is not None
+        assert not isinstance(filling.material, Transparent)  # there is no --index
         return Subject(self._shape(), filling.material, filling.medium).tilted(self.tilt_deg)
 
     def _shape(self) -> TriangleMesh:

@@ -76,7 +76,7 @@ class _Hologram:
         self.pitch, self.options, self.optics = bins * optics.pixel, options, optics
         far = max(optics.distances) - options.depth[0]
         reach = 0.61 * optics.wavelength * far / options.usual_radius / self.pitch  # of the central disc of diffraction
-        self.shape = tuple(next_fast_len(n + math.ceil(reach)) for n in binned.shape[1:])
+        self.shape = tuple(int(next_fast_len(n + math.ceil(reach))) for n in binned.shape[1:])
         self.first = [(m - n) // 2 for m, n in zip(self.shape, binned.shape[1:])]
         self.inside = tuple(slice(f, f + n) for f, n in zip(self.first, binned.shape[1:]))
         # from the middle of the uncut frames to that of the raster's sample [0, 0]

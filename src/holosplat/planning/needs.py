@@ -206,7 +206,8 @@ def of_reconstruction(
     if not each:
         return None
     worked, first = seen.windows or sizes, max(each, key=lambda one: one.memory)
-    decided = of_choice(worked, _without_rounds(method) if seen.noisy else method) if isinstance(method, Auto) else 0.0
+    settled = _without_rounds(method) if seen.noisy else method
+    decided = of_choice(worked, settled) if isinstance(settled, Auto) else 0.0
     decided += of_ratio(worked) if not ratio_told and isinstance(method, Auto | SmoothVolume) else 0.0
     least = min(one.least_memory or one.memory for one in each) if len(each) > 1 else first.least_memory
     most = max(one.most_seconds or one.seconds for one in each) + decided
