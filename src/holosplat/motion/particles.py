@@ -76,7 +76,8 @@ class _Hologram:
         self.pitch, self.options, self.optics = bins * optics.pixel, options, optics
         far = max(optics.distances) - options.depth[0]
         reach = 0.61 * optics.wavelength * far / options.usual_radius / self.pitch  # of the central disc of diffraction
-        self.shape = tuple(int(next_fast_len(n + math.ceil(reach))) for n in binned.shape[1:])
+        lengths = np.add(binned.shape[1:], math.ceil(reach)).tolist()
+        self.shape: tuple[int, ...] = tuple(map(next_fast_len, lengths))  # type: ignore[arg-type]
         self.first = [(m - n) // 2 for m, n in zip(self.shape, binned.shape[1:])]
         self.inside = tuple(slice(f, f + n) for f, n in zip(self.first, binned.shape[1:]))
         # from the middle of the uncut frames to that of the raster's sample [0, 0]
