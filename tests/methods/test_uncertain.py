@@ -14,9 +14,11 @@ from helpers.blobs import SHAPE, blob_scan
 from helpers.soft import MATERIAL, two_cells
 from holosplat.baselines import HolographicTV
 from holosplat.baselines.beyond import rows_beyond
+from holosplat.baselines.material import estimate_ratio
 from holosplat.checks import InputError
 from holosplat.matter import MaterialPrior
 from holosplat.methods import Task
+from holosplat.methods.method import quiet
 from holosplat.methods.profile import Profile, ProfileOptions, without_specks
 from holosplat.methods.uncertain import Determined, Search, Uncertain, at_energy, determine, likeliest_ratio, told
 
@@ -57,6 +59,25 @@ def test_a_ratio_is_found_where_nothing_is_known(scan):
     assert found.told
     assert found.value == pytest.approx(MATERIAL.ratio, rel=0.15)
     assert found.low < MATERIAL.ratio < found.high
+
+
+def test_the_search_begins_at_the_estimate_within_the_range(scan, monkeypatch):
+    """Of δ/β, and of nothing else: a distance begins in the middle of its range."""
+    tried = list[dict[str, float]]()
+
+    def first(self, constants):
+        tried.append(dict(constants))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Profile, "__call__", first)
+    estimate = estimate_ratio(scan, quiet)
+    for high in (2 * estimate, 0.5 * estimate):
+        ranges = Uncertain(distance=(0.04, 0.09), delta_beta=(0.1 * estimate, high))
+        with pytest.raises(KeyboardInterrupt):
+            determine(Task(scan, MaterialPrior.unknown()), ranges, QUICK)
+    assert [one["distance"] for one in tried] == pytest.approx([0.06, 0.06])
+    at = estimate_ratio(replace(scan, exposures=replace(scan.exposures, distance=0.06)), quiet)
+    assert [one["delta_beta"] for one in tried] == pytest.approx([at, 0.5 * estimate])
 
 
 class Valley:

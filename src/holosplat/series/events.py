@@ -136,7 +136,7 @@ class History:
         return cls(tuple(tracks), tuple(sorted(events, key=lambda event: event.first)))
 
     def lines(self, times: Sequence[float]) -> list[str]:
-        """Every event in words; times: [T] s."""
+        """One line for each event; times: [T] s."""
         return [
             f"{event.kind} between {times[event.first]:.6g} and {times[event.last]:.6g} s: "
             f"{WHAT[event.of]} {_numbers(event.before)} → {_numbers(event.after)}"
