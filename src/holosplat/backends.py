@@ -15,7 +15,7 @@ from typing import Literal, get_args
 import torch
 
 from . import native
-from .checks import InputError, MissingError
+from .checks import InputError, MissingError, require
 
 Backend = Literal["auto", "cpu", "cuda", "reference"]
 """What may be asked to compute."""
@@ -54,6 +54,12 @@ def implementation(package: str, backend: str) -> ModuleType:
     except ImportError as error:
         reason = _missing_cuda() if backend == "cuda" else ""
         raise MissingError(f"{package} cannot use backend {backend!r}: {reason or error}.") from error
+
+
+def require_device(device: str) -> None:
+    """`InputError` where `device` (cpu or cuda) cannot be used."""
+    reason = missing(device)
+    require(device == "cpu" or not reason, f"device {device} cannot be used: {reason}; take device cpu.")
 
 
 def support_table() -> list[list[str]]:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from ..backends import require_device
 from ..checks import InputError, as_written, in_range, require
 from ..fit.run import interrupts_held
 from ..io.atomic import atomic_path, require_new
@@ -28,6 +29,8 @@ from ..specimens.red_cells import DIAMETER, SHUFFLES, place_cells
 from ..units import in_percent
 
 FORMAT = "holosplat cells 1"
+COMPACT = "cells_{:03d}.npz"
+"""Nodes [C, P, 3] [m] of a snapshot, not folded, faces [F, 3] and time [s]."""
 TRAVEL = 1e-6
 """Distance [m] that the fastest fluid moves between snapshots without a given interval."""
 MOST_VOLUME, MOST_AREA = 0.01, 0.05
@@ -62,6 +65,10 @@ class Growth:
     """Seed of the cells' places and directions."""
     tolerance: float = 1e-3
     """Greatest estimated error of a step in time, in mean edges of the mesh."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where velocities are computed; a GPU pays from some fifty cells on."""
+    compact: bool = False
+    """Whether a snapshot is one file of nodes, cells_TTT.npz, as `train --network dynamics` reads it, and no meshes."""
     elasticity: Elasticity = field(default_factory=Elasticity)
     medium: Medium = field(default_factory=Medium)
 
@@ -74,6 +81,7 @@ class Growth:
         in_range("interval", self.period, 1e-12, 1e3, unit="seconds")
         require(0 <= self.warm_up <= 1e3, f"warm_up must be from 0 to 1000 s, but it is {self.warm_up}.")
         in_range("tolerance", self.tolerance, 1e-8, 0.1)
+        require_device(self.device)
 
     @property
     def period(self) -> float:
@@ -86,7 +94,7 @@ class Growth:
 
     def suspension(self) -> Suspension:
         """The cells' membrane in the channel."""
-        membrane = Membrane(resting_cell(self.frequency, self.diameter), self.elasticity)
+        membrane = Membrane(resting_cell(self.frequency, self.diameter), self.elasticity, self.device)
         return Suspension(membrane, Channel(self.box, self.flow), self.medium)
 
     def placed(self, suspension: Suspension) -> Tensor:
@@ -94,7 +102,7 @@ class Growth:
         mesh, margin = suspension.membrane.mesh, suspension.repulsion.range_
         found = place_cells(self.cells, self.box, self.seed, self.diameter, 0.0, margin, "box", shuffles=SHUFFLES)
         nodes = np.stack([mesh.vertices @ cell.rotation.T + cell.centre for cell in found])
-        return torch.from_numpy(nodes + 0.5 * np.asarray(self.box))
+        return torch.from_numpy(nodes + 0.5 * np.asarray(self.box)).to(self.device)
 
 
 @dataclass(frozen=True)
@@ -141,17 +149,23 @@ class SeriesFolder:
 
     def write_snapshot(self, growth: Growth, suspension: Suspension, snapshot: int, state: State) -> None:
         """Add a snapshot: its meshes, the collection, and the state."""
-        for cell, nodes in enumerate(suspension.channel.folded(state.nodes).numpy()):
-            write_mesh(self.file(cell, snapshot), TriangleMesh(nodes, suspension.membrane.mesh.faces))
-        steps = [
-            TimeStep(growth.instant(n) - growth.warm_up, tuple(self.file(c, n) for c in range(growth.cells)))
-            for n in range(snapshot + 1)
-        ]
-        write_pvd(self.collection, steps)
+        kept, faces = state.nodes.cpu(), suspension.membrane.mesh.faces
+        if growth.compact:
+            with atomic_path(self.path / COMPACT.format(snapshot)) as temporary:
+                time = growth.instant(snapshot) - growth.warm_up
+                np.savez_compressed(temporary, nodes=kept.numpy(), faces=faces, time=np.array(time))
+        else:
+            for cell, nodes in enumerate(suspension.channel.folded(kept).numpy()):
+                write_mesh(self.file(cell, snapshot), TriangleMesh(nodes, faces))
+            steps = [
+                TimeStep(growth.instant(n) - growth.warm_up, tuple(self.file(c, n) for c in range(growth.cells)))
+                for n in range(snapshot + 1)
+            ]
+            write_pvd(self.collection, steps)
         with atomic_path(self.state) as temporary:
             np.savez(
                 temporary,
-                nodes=state.nodes.numpy(),
+                nodes=kept.numpy(),
                 numbers=np.array([state.time, state.step]),
                 counts=np.array([snapshot, state.taken, state.refused]),
             )
@@ -168,7 +182,20 @@ class SeriesFolder:
             (time, step), (snapshot, taken, refused) = numbers, counts
             good = step > 0 and 0 <= time < np.inf and min(snapshot, taken, refused) >= 0
             require(good and step < np.inf, f"{self.state} is damaged; start anew.")
-        return snapshot, State(torch.from_numpy(nodes), time, step, taken, refused)
+        return snapshot, State(torch.from_numpy(nodes).to(growth.device), time, step, taken, refused)
+
+
+def read_compact(folder: SeriesFolder) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Nodes [T, C, P, 3] [m], not folded, faces [F, 3] and times [T] [s] of a folder of `grow --compact`; `InputError`
+    for any other."""
+    files = sorted(folder.path.glob(COMPACT.replace("{:03d}", "*")))
+    require(len(files) > 0, f"{folder.path} must hold what grow --compact wrote, but there is no cells_000.npz.")
+    found = [read_archive(file, what="a snapshot of grow --compact") for file in files]
+    with as_written(folder.path, "what grow --compact wrote"):
+        nodes, times = np.stack([one["nodes"] for one in found]), np.array([float(one["time"]) for one in found])
+        faces = np.asarray(found[0]["faces"])
+        require(nodes.ndim == 4 and nodes.shape[-1] == 3 and bool(np.isfinite(nodes).all()), "nodes are not [C, P, 3].")
+    return nodes, faces, times
 
 
 def grow(

@@ -29,8 +29,9 @@ def grow(out: Output, what: Growth, resume: bool = False) -> None:
     tell("grow", _needs(what), out, coarser)
     with interruptible(lambda: _cut_off(SeriesFolder(out))), sole_writer(out), ProgressBar() as bar:
         grown = run(what, out, resume, bar.of("cells in flow"))
+    wrote = out if what.compact else SeriesFolder(out).collection
     say(
-        f"wrote {SeriesFolder(out).collection}: {grown.snapshots} snapshots of {what.cells} cells, "
+        f"wrote {wrote}: {grown.snapshots} snapshots of {what.cells} cells, "
         f"{what.period:.4g} s apart; {grown.state.taken} steps, {grown.state.refused} refused; "
         f"volume within {in_percent(grown.volume)}, area within {in_percent(grown.area)}"
     )

@@ -16,7 +16,10 @@ from .room import tell
 from .sentence import interruptible
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from ..planning.needs import Needs
+    from ..training.train import Training
 
 Layout = Literal["nerf-synthetic", "r2-gaussian", "onix"]
 """Those of `training.export`, which loads torch."""
@@ -79,19 +82,30 @@ def train(
 ) -> None:
     """Train a network on scenes of `holosplat dataset`: weights with a card, and curves.
 
-    That of `--start learned`, or, by --network, those of the methods onix and pixelnerf, which see frames alone.
+    That of `--start learned`, or, by --network, those of the methods onix and pixelnerf, which see frames alone, or
+    dynamics, that of `forecast --model graph`, which learns from series of `grow --compact`.
 
     Args:
-        data: Folder of scenes.
+        data: Folder of scenes, or of folders of `grow --compact`.
         out: Folder to make.
         resume: Go on with an interrupted training; --resume FOLDER alone, with its scenes and options.
     """
-    from ..planning.acts import of_training
     from ..report.curves import training_curves
+    from ..training.dynamics import train_dynamics
+    from ..training.train import made_by
+
+    who = made_by(how.device)  # before files change under hours of work
+    if how.network == "dynamics":
+        with ProgressBar() as bar, interruptible(lambda: _kept(out)):
+            weights, judged = train_dynamics(data, out, how, resume, _show(bar, how), who)
+        print(f"errors across surfaces of series that were not trained on, in radii: {judged.last()}")
+        print(f"wrote {weights} and {training_curves(out)}")
+        return
+    from ..planning.acts import of_training
     from ..training.aligned import AlignedTraining, AlignedValidation
     from ..training.folder import Dataset
     from ..training.shown import Validation
-    from ..training.train import Training, made_by
+    from ..training.train import Training
 
     scenes = Dataset.read(data)
     scenes.require_whole()
@@ -100,13 +114,20 @@ def train(
     tell("the training", of_training(frames, views, how.network, how.size, how.steps), out)
     kind = Training if how.network == "start" else AlignedTraining
     training = (kind.resumed if resume else kind.begun)(scenes, out, how)
-    who = made_by(how.device)  # before files change under hours of work
     with ProgressBar() as bar:
         told = Validation.of(scenes.ranges, scenes.seed, how.validation, bar.of("scenes to validate"))
         if how.network != "start":
             told = AlignedValidation(told.samples, network=how.network)
-        with interruptible(lambda: f"interrupted; {out} keeps the last checkpoint, go on with --resume"):
-            training.run(told, lambda now: bar.show("training", now.step / how.steps, now.record))
+        with interruptible(lambda: _kept(out)):
+            training.run(told, _show(bar, how))
     weights = training.finish(told, who)
     print(f"Dice of scenes of another seed: {told.last()}")
     print(f"wrote {weights} and {training_curves(out)}")
+
+
+def _kept(out: Path) -> str:
+    return f"interrupted; {out} keeps the last checkpoint, go on with --resume"
+
+
+def _show(bar: ProgressBar, how: TrainOptions) -> Callable[[Training], None]:
+    return lambda now: bar.show("training", now.step / how.steps, now.record)

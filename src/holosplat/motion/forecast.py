@@ -303,11 +303,11 @@ def _at(
     for k, split in enumerate(splits):
         faces = bodies.body(k)[1].numpy()
         usual = np.mean([TriangleMesh(one, faces).volume for one in split.places(inside, window)])
-        found[k] = np.array([_of_volume(one, faces, float(usual)) for one in found[k]])
+        found[k] = np.array([of_volume(one, faces, float(usual)) for one in found[k]])
     return found
 
 
-def _of_volume(vertices: np.ndarray, faces: np.ndarray, volume: float) -> np.ndarray:
+def of_volume(vertices: np.ndarray, faces: np.ndarray, volume: float) -> np.ndarray:
     """The body scaled about its middle such that it has the `volume` [m³]; as it is where it is turned inside out."""
     middle, share = vertices.mean(0), volume / TriangleMesh(vertices, faces).volume
     return middle + share ** (1 / 3) * (vertices - middle) if share > 0 else vertices

@@ -278,14 +278,19 @@ def _figure(curves: dict[str, np.ndarray], scores: dict[str, np.ndarray]) -> Fig
     figure = new_figure(WIDTH, 2.3)
     left, right = figure.subplots(1, 2)
     left.plot(curves["step"], _smooth(curves["loss"]), color=INK, lw=1.0)
-    left.set(xlabel="step", ylabel="loss", yscale="log")
+    left.set(xlabel="step", ylabel="loss", yscale="log" if (curves["loss"] > 0).all() else "linear")
     letter(left, 0, f"What is minimised, mean of {SMOOTHED} steps")
-    for colour, count in zip(CYCLE, np.unique(scores["views"])):
-        of = scores["views"] == count
-        right.plot(scores["step"][of], scores["dice"][of], color=colour, marker="o", ms=2.2, label=f"{count:.0f} views")
-    right.set(xlabel="step", ylabel="Dice", ylim=(0, 1))
-    right.legend(loc="lower right")
-    letter(right, 1, "Guesses of scenes of another seed")
+    of_views = "views" in scores
+    key, value, unit = ("views", "dice", "views") if of_views else ("ahead", "missed", "snapshots ahead")
+    for colour, count in zip(CYCLE, np.unique(scores[key])):
+        of = scores[key] == count
+        steps = np.unique(scores["step"][of])
+        means = [scores[value][of & (scores["step"] == step)].mean() for step in steps]
+        right.plot(steps, means, color=colour, marker="o", ms=2.2, label=f"{count:.0f} {unit}")
+    right.set(xlabel="step", ylabel="Dice" if of_views else "error across surfaces / radii")
+    right.set(**{"ylim": (0, 1)} if of_views else {"yscale": "log"})
+    right.legend(loc="lower right" if of_views else "upper right")
+    letter(right, 1, "Scenes that were not trained on")
     return figure
 
 

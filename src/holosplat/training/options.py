@@ -87,9 +87,9 @@ class TrainOptions:
     """How scenes are shown."""
     goal: LossWeights = field(default_factory=LossWeights)
     """The training loss."""
-    network: Literal["start", "onix", "pixelnerf"] = "start"
+    network: Literal["start", "onix", "pixelnerf", "dynamics"] = "start"
     """What is trained: the network of `--start learned`, or those of the methods `onix` and `pixelnerf`, which learn
-    from frames alone; these are of one size."""
+    from frames alone, or that of `forecast --model graph`, on series of grow; these are of one size."""
     frames: FrameLossWeights = field(default_factory=FrameLossWeights)
     """The training loss of networks that learn from frames alone."""
 

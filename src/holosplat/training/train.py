@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
 
-from ..backends import missing
+from ..backends import require_device
 from ..checks import InputError, as_written, require
 from ..io.atomic import write_rows, write_state
 from ..io.json import read_json, write_json
@@ -66,7 +66,7 @@ class Training:
     @classmethod
     def begun(cls, data: Dataset, folder: Path, options: TrainOptions) -> Training:
         """A training in a new folder; `InputError` where there is something in it, or its device cannot be used."""
-        _require_device(options)
+        require_device(options.device)
         if folder.exists() and any(folder.iterdir()):
             raise InputError(f"{folder} must be new or empty, but it is not; choose another --out, or --resume.")
         folder.mkdir(parents=True, exist_ok=True)
@@ -77,7 +77,7 @@ class Training:
     def resumed(cls, data: Dataset, folder: Path, options: TrainOptions) -> Training:
         """The training in `folder` after its last checkpoint; `InputError` where it is one of other options or data, or
         its device cannot be used."""
-        _require_device(options)
+        require_device(options.device)
         settings = folder / SETTINGS
         require(settings.is_file(), f"{folder} holds no training that could go on; leave --resume.")
         require(
@@ -179,13 +179,6 @@ class Training:
         asked, device = self.options.precision, self.options.device
         short = device == "cuda" or has_bfloat16() if asked == "auto" else asked == "bfloat16"
         return torch.autocast(device, torch.bfloat16) if short else nullcontext()
-
-
-def _require_device(options: TrainOptions) -> None:
-    reason = missing(options.device)
-    require(
-        options.device == "cpu" or not reason, f"device {options.device} cannot be used: {reason}; take device cpu."
-    )
 
 
 def _settings(data: Dataset, options: TrainOptions) -> dict[str, Any]:

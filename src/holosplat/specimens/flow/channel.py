@@ -16,9 +16,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numpy as np
 import torch
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from ...checks import in_range, require
@@ -98,9 +96,9 @@ class Channel:
         short, long = (1, 2) if self.box[1] <= self.box[2] else (2, 1)
         y = (points[..., short] - a) / a
         z = ((points[..., long] - b) / a).abs()
-        n = torch.arange(1, 2 * TERMS, 2, dtype=points.dtype)
+        n = torch.arange(1, 2 * TERMS, 2, dtype=points.dtype, device=points.device)
         k = 0.5 * math.pi * n
-        sign = 1 - 2 * (torch.arange(TERMS, dtype=points.dtype) % 2)
+        sign = 1 - 2 * (torch.arange(TERMS, dtype=points.dtype, device=points.device) % 2)
         decay = torch.exp(k * (z.clamp(max=b / a).unsqueeze(-1) - b / a))
         decay = decay * (1 + torch.exp(-2 * k * z.unsqueeze(-1))) / (1 + torch.exp(-2 * k * b / a))
         series = (sign / n**3 * torch.cos(k * y.unsqueeze(-1)) * decay).sum(-1)
@@ -143,26 +141,43 @@ def wall_forces(nodes: Tensor, channel: Channel, repulsion: Repulsion) -> Tensor
 
 def contact_forces(nodes: Tensor, channel: Channel, repulsion: Repulsion) -> Tensor:
     """Forces [C, P, 3] [N] between nodes [C, P, 3] [m] of different cells, across the channel's periodic ends too."""
-    first, second = _near_pairs(nodes, channel, repulsion.range_)
+    first, second, shift = _near_pairs(nodes, channel, repulsion.range_)
     flat = nodes.reshape(-1, 3)
-    apart = flat[first] - flat[second]
-    period = channel.box[0]
-    along = apart[:, 0] - period * torch.round(apart[:, 0] / period)
-    apart = torch.cat([along[:, None], apart[:, 1:]], dim=1)
+    apart = flat[first] - flat[second] - shift
     distance = apart.norm(dim=-1, keepdim=True)
     push = repulsion.force(distance) * apart / distance.clamp(min=CLOSEST * repulsion.range_)
     total = torch.zeros_like(flat).index_add(0, first, push).index_add(0, second, -push)
     return total.reshape(nodes.shape)
 
 
-def _near_pairs(nodes: Tensor, channel: Channel, reach: float) -> tuple[Tensor, Tensor]:
-    """Numbers of nodes of different cells closer than `reach`, each pair once."""
-    points = nodes.detach().reshape(-1, 3).numpy().copy()
-    period = channel.box[0]
-    points[:, 0] = np.mod(points[:, 0], period)
-    points[points[:, 0] >= period, 0] = 0.0  # the rest of a tiny negative number is the period itself
-    tree = KDTree(points, boxsize=[period, 0, 0])
-    pairs = tree.query_pairs(reach, output_type="ndarray").astype(np.int64)
-    cell = pairs // nodes.shape[1]
-    pairs = pairs[cell[:, 0] != cell[:, 1]]
-    return torch.from_numpy(pairs[:, 0].copy()), torch.from_numpy(pairs[:, 1].copy())
+def _near_pairs(nodes: Tensor, channel: Channel, reach: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Numbers [N], [N] of nodes of different cells closer than `reach`, each pair once, and how far the second one's
+    image is shifted [N, 3] [m]."""
+    nodes = nodes.detach()
+    cells, size, _ = nodes.shape
+    centres = nodes.mean(1)
+    local = nodes - centres[:, None]
+    radius = local.norm(dim=-1).amax(1)
+    one, other = torch.triu_indices(cells, cells, 1, device=nodes.device)
+    found = []
+    for turn in (-1.0, 0.0, 1.0):
+        way = centres[other] - centres[one]
+        period = way.new_tensor([channel.box[0], 0.0, 0.0])
+        shift = (turn - torch.round(way[:, :1] / channel.box[0])) * period
+        near = torch.nonzero((way + shift).norm(dim=-1) < radius[one] + radius[other] + reach)[:, 0]
+        for k in near.split(max(1, pairs_at_a_time(nodes.device) // size**2)):
+            i, j = one[k], other[k]
+            # Differences of coordinates about one centre keep their digits in the squares of `cdist`.
+            apart = torch.cdist(local[i], local[j] + (way + shift)[k][:, None])
+            pair, p, q = torch.nonzero(apart < reach, as_tuple=True)
+            found.append((i[pair] * size + p, j[pair] * size + q, shift[k][pair]))
+    if not found:
+        none = torch.zeros(0, dtype=torch.long, device=nodes.device)
+        return none, none, nodes.new_zeros(0, 3)
+    first, second, shift = (torch.cat(part) for part in zip(*found))
+    return first, second, shift
+
+
+def pairs_at_a_time(device: torch.device) -> int:
+    """Pairs of nodes in one array: what a processor's cache holds, or what keeps a GPU busy."""
+    return 1 << (17 if device.type == "cpu" else 25)

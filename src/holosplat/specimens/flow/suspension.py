@@ -12,7 +12,7 @@ from torch import Tensor
 from ...checks import InputError, in_range, require
 from ...ranges import Positive, ranged
 from ..membrane.model import Membrane
-from .channel import Channel, Repulsion, contact_forces, wall_forces
+from .channel import Channel, Repulsion, contact_forces, pairs_at_a_time, wall_forces
 
 BLOB = 0.39
 """ε in square roots of a node's area, at which a ball of evenly spaced nodes drags as Stokes says (tests)."""
@@ -30,7 +30,7 @@ def stokeslet_velocity(targets: Tensor, sources: Tensor, forces: Tensor, blob: f
 
 
 def mutual_velocity(first: Tensor, second: Tensor, forces: tuple[Tensor, Tensor], blob: float) -> tuple[Tensor, Tensor]:
-    """8πμ times the velocities that two sets of nodes [P, 3], [Q, 3] and their `forces` give each other.
+    """8πμ times the velocities that two sets of nodes [..., P, 3], [..., Q, 3] and their `forces` give each other.
 
     One pass over the pairs serves both ways.
     """
@@ -38,26 +38,27 @@ def mutual_velocity(first: Tensor, second: Tensor, forces: tuple[Tensor, Tensor]
     cube = square.rsqrt() / square
     even = torch.addcmul(cube * square, cube, square.new_tensor(blob**2))
     f, g = forces
-    along = cube * (first @ g.T - (second * g).sum(-1))
-    on_first = even @ g + first * along.sum(1, keepdim=True) - along @ second
-    along = cube * (f @ second.T - (first * f).sum(-1, keepdim=True))
-    on_second = even.T @ f + second * along.sum(0)[:, None] - along.T @ first
+    along = cube * (first @ g.mT - (second * g).sum(-1).unsqueeze(-2))
+    on_first = even @ g + first * along.sum(-1, keepdim=True) - along @ second
+    along = cube * (f @ second.mT - (first * f).sum(-1, keepdim=True))
+    on_second = even.mT @ f + second * along.sum(-2).unsqueeze(-1) - along.mT @ first
     return on_first, on_second
 
 
 def _one_way(targets: Tensor, sources: Tensor, forces: Tensor, blob: float) -> Tensor:
-    """8πμ times the velocity [T, 3]."""
+    """8πμ times the velocity [..., T, 3]."""
     square = _squares(targets, sources, blob)
     cube = square.rsqrt() / square
-    along = cube * (targets @ forces.T - (sources * forces).sum(-1))
+    along = cube * (targets @ forces.mT - (sources * forces).sum(-1).unsqueeze(-2))
     even = torch.addcmul(cube * square, cube, square.new_tensor(blob**2))
-    return even @ forces + targets * along.sum(1, keepdim=True) - along @ sources
+    return even @ forces + targets * along.sum(-1, keepdim=True) - along @ sources
 
 
 def _squares(targets: Tensor, sources: Tensor, blob: float) -> Tensor:
-    """r² + ε² [T, S]."""
-    offsets = (targets**2).sum(-1, keepdim=True) + (sources**2).sum(-1) + blob**2
-    return torch.addmm(offsets, targets, sources.T, alpha=-2).clamp_min_(blob**2)
+    """r² + ε² [..., T, S]."""
+    offsets = (targets**2).sum(-1, keepdim=True) + (sources**2).sum(-1).unsqueeze(-2) + blob**2
+    product = torch.addmm if targets.dim() == 2 else torch.baddbmm
+    return product(offsets, targets, sources.mT, alpha=-2).clamp_min_(blob**2)
 
 
 PLASMA_VISCOSITY = 1.2e-3
@@ -127,27 +128,26 @@ class Suspension:
         """Velocity [C, P, 3] [m/s] of nodes [C, P, 3] [m] in the flow that `forces` [C, P, 3] [N] on them cause."""
         centres = nodes.mean(1)
         local = nodes - centres[:, None]  # small numbers, whose squares keep their digits
-        disturbance = torch.stack(
-            [stokeslet_velocity(x, x, f, self.blob, self.medium.viscosity) for x, f in zip(local, forces)]
-        )
-        scale = 1 / (8 * math.pi * self.medium.viscosity)
-        for i, j, shift, weight in self._neighbours(centres):
-            of_both = forces[i], forces[j]
-            on_i, on_j = mutual_velocity(local[i], local[j] + shift, of_both, self.blob)
-            disturbance[i] += weight * scale * on_i
-            disturbance[j] += weight * scale * on_j
-        return disturbance
+        some = max(1, pairs_at_a_time(nodes.device) // nodes.shape[1] ** 2)
+        parts = zip(local.split(some), forces.split(some))
+        total = torch.cat([_one_way(x, x, f, self.blob) for x, f in parts])
+        one, other, way, weight = self._neighbours(centres)
+        for k in torch.arange(len(one), device=nodes.device).split(some):
+            i, j = one[k], other[k]
+            on_i, on_j = mutual_velocity(local[i], local[j] + way[k, None], (forces[i], forces[j]), self.blob)
+            faded = weight[k, None, None]
+            total = total.index_add(0, i, faded * on_i).index_add(0, j, faded * on_j)
+        return total / (8 * math.pi * self.medium.viscosity)
 
-    def _neighbours(self, centres: Tensor) -> list[tuple[int, int, Tensor, float]]:
-        """Pairs of cells within reach: their numbers, the way [3] from the first to the second, and the weight."""
-        first, second = torch.triu_indices(len(centres), len(centres), 1)
+    def _neighbours(self, centres: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Pairs of cells within reach: their numbers [M], the ways [M, 3] from first to second, the weights [M]."""
+        first, second = torch.triu_indices(len(centres), len(centres), 1, device=centres.device)
         way = centres[second] - centres[first]
         period = self.channel.box[0]
-        way[:, 0] -= period * torch.round(way[:, 0] / period)
+        way = torch.cat([way[:, :1] - period * torch.round(way[:, :1] / period), way[:, 1:]], dim=1)
         weight = _fading(way.norm(dim=-1) / self.reach)
-        return [
-            (int(first[k]), int(second[k]), way[k], float(weight[k])) for k in torch.nonzero(weight > 0)[:, 0].tolist()
-        ]
+        near = torch.nonzero(weight > 0)[:, 0]
+        return first[near], second[near], way[near], weight[near]
 
 
 def _fading(ratio: Tensor) -> Tensor:

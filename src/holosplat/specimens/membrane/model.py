@@ -155,10 +155,12 @@ class Membrane:
     All methods take nodes [..., P, 3] [m], any number of cells of this rest shape.
     """
 
-    def __init__(self, mesh: TriangleMesh, elasticity: Elasticity = Elasticity()) -> None:
+    def __init__(
+        self, mesh: TriangleMesh, elasticity: Elasticity = Elasticity(), device: torch.device | str = "cpu"
+    ) -> None:
         self.mesh = mesh
         self.elasticity = elasticity
-        self.rest = RestShape.of(mesh)
+        self.rest = RestShape.of(mesh).to(device=device)
 
     def energies(self, nodes: Tensor) -> dict[str, Tensor]:
         """Each energy [...] [J] with a modulus other than 0, by its name."""

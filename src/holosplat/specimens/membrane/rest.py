@@ -62,10 +62,11 @@ class RestShape:
             enclosed_volume(corners),
         )
 
-    def to(self, dtype: torch.dtype) -> RestShape:
-        """The same with its measures in `dtype`."""
+    def to(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> RestShape:
+        """The same with its measures in `dtype`, on `device`."""
         found = {field.name: getattr(self, field.name) for field in fields(self)}
-        return RestShape(**{name: t.to(dtype) if t.is_floating_point() else t for name, t in found.items()})
+        floats = {name: dtype if t.is_floating_point() else None for name, t in found.items()}
+        return RestShape(**{name: t.to(device, floats[name]) for name, t in found.items()})
 
 
 def _hinges(mesh: TriangleMesh) -> tuple[Tensor, Tensor, Tensor]:
