@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import argparse
 import platform
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 
@@ -34,8 +34,10 @@ from holosplat.metrics.volumes import normal_distance
 from holosplat.motion.cell_model import ChannelFrame
 from holosplat.motion.dynamics import DynamicsForecast, carry
 from holosplat.motion.elastic import Rest
-from holosplat.motion.forecast import Forecast, Halves, PathForecast, extrapolate
+from holosplat.motion.forecast import Forecast, Forecaster, Halves, History, PathForecast, extrapolate
+from holosplat.motion.learned import GraphForecast
 from holosplat.motion.measures import half_sets
+from holosplat.motion.modes import ModesForecast
 from holosplat.motion.track import TrackOptions, follow
 from holosplat.representations import MovingSurfaces
 from holosplat.representations.paths import TimeBasis
@@ -55,6 +57,11 @@ MODELS = {
     "wrong shear": replace(GIVEN, shear=(50e-6, 50e-6), free=False),
     "wrong viscosity": replace(GIVEN, viscosity=1.2e-2, shear=(2.9e-6, 2.9e-6), free=False),
     "wrong walls": replace(GIVEN, frame=ChannelFrame((48e-6, 36e-6)), free=False),
+}
+LEARNED: dict[str, Forecaster] = {
+    "graph": GraphForecast(),
+    "dmd": ModesForecast("dmd"),
+    "sindy": ModesForecast("sindy"),
 }
 DICE = ("paths", "auto")
 PIECES = 3
@@ -149,22 +156,35 @@ def truly(cells: MeshSeries, times: int) -> MovingSurfaces:
 
 
 def forecasts(
-    bodies: MovingSurfaces, halves: Halves | None, times: np.ndarray, ahead: np.ndarray
+    bodies: MovingSurfaces, halves: Halves | None, times: np.ndarray, ahead: np.ndarray, only: Collection[str]
 ) -> Iterator[tuple[str, Forecast, str]]:
-    """Every model's, by name, and what it found of the flow."""
+    """The models' asked for, by name, and what each found of the flow; paths, splines and rigid bodies always."""
     found = extrapolate(bodies, times, ahead, PathForecast(), halves)
     yield "splines", replace(found, bodies=bodies, band=np.full_like(found.band, np.nan)), ""
     yield "paths", found, ""
+    history = History(bodies, times, halves)
+    for name, way in LEARNED.items():
+        if name in only:
+            yield name, way.fit(history).ahead(ahead), ""
     yield "rigid", extrapolate(bodies, times, ahead, PathForecast(rigid=True), halves), ""
     for name, options in MODELS.items():
+        if name not in only:
+            continue
         found, flow = carry(bodies, times, ahead, options, PathForecast(), halves)
         yield name, found, " ".join(f"{key}={value:.4g}" for key, value in flow.items())
 
 
 def rows_of(
-    case: str, data: Path, first: int, times: int, seed: int, keep: Path | None, true: bool = False
+    case: str,
+    data: Path,
+    first: int,
+    times: int,
+    seed: int,
+    keep: Path | None,
+    true: bool = False,
+    only: Collection[str] = (*LEARNED, *MODELS),
 ) -> Iterator[Row]:
-    """All models at all times ahead; true: begun with the cells themselves."""
+    """All models at all times ahead, or `only` some; true: begun with the cells themselves."""
     cells = cells_in_flow(data, first, times + max(AHEAD))
     scan = imaged(cells, ANGLES[case], seed)
     kept = scan[np.flatnonzero(scan.exposures.time <= cells.times[times - 1])]
@@ -177,7 +197,8 @@ def rows_of(
     frames = {h: hs.simulate(cells, exposures.repeated(cells.times[[last + h]])) for h in AHEAD}
     judge = Judge(cells, pairs, frames, intensity_range(kept.frames), last)
     machine = f"{platform.machine()}, {torch.get_num_threads()} of 2 cores, shared"
-    for model, found, said in forecasts(bodies, halves, cells.times[:times], cells.times[[last + h for h in AHEAD]]):
+    ahead = cells.times[[last + h for h in AHEAD]]
+    for model, found, said in forecasts(bodies, halves, cells.times[:times], ahead, only):
         for h, band in zip(AHEAD, found.band):
             error = 1e6 * float(np.sqrt(np.mean([band[k] ** 2 for _, k in pairs])))
             away, worst, ssim, dice = judge.scores(found.bodies, h, model in DICE)
@@ -193,12 +214,15 @@ def main() -> None:
     parser.add_argument("--times", type=int, default=24, help="that are tracked")
     parser.add_argument("--first", type=int, default=0, help="snapshot of the first time")
     parser.add_argument("--seed", type=int, default=1, help="of the photons and of the fits")
+    parser.add_argument("--only", nargs="+", choices=(*LEARNED, *MODELS), default=[*LEARNED, *MODELS])
     parser.add_argument("--true", action="store_true", help="forecasts from the cells themselves")
     parser.add_argument("--write", action="store_true")
     parser.add_argument("--keep", type=Path, help="folder of tracked bodies")
     asked = parser.parse_args()
     rows = []
-    for row in rows_of(asked.case, asked.data, asked.first, asked.times, asked.seed, asked.keep, asked.true):
+    for row in rows_of(
+        asked.case, asked.data, asked.first, asked.times, asked.seed, asked.keep, asked.true, asked.only
+    ):
         print(*astuple(row)[:13], sep="; ", flush=True)
         rows.append(row)
     if asked.write:

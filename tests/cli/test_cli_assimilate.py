@@ -1,4 +1,4 @@
-"""`forecast --model assimilate`: mechanics fitted to the frames of a run themselves, on a cell in a channel."""
+"""`forecast --by assimilate`: mechanics fitted to the frames of a run themselves, on a cell in a channel."""
 
 from __future__ import annotations
 
@@ -70,8 +70,8 @@ def folder(tmp_path_factory) -> Path:
                          "--out", folder / "run"))  # fmt: skip
     how = ("--times", 1, "--no-half-sets", "--channel", *CHANNEL, "--peak", "0.046:0.056")
     with undrawn():
-        said = worked(holosplat("forecast", folder / "run", *how, "--model", "assimilate", "--out", folder / "later"))
-        worked(holosplat("forecast", folder / "run", *how[:3], "--model", "paths", "--out", folder / "paths"))
+        said = worked(holosplat("forecast", folder / "run", *how, "--by", "assimilate", "--out", folder / "later"))
+        worked(holosplat("forecast", folder / "run", *how[:3], "--by", "paths", "--out", folder / "paths"))
     (folder / "said.txt").write_text(said.out)
     return folder
 
@@ -108,5 +108,5 @@ def test_what_the_window_tells_is_said_and_what_it_does_not(folder):
 
 def test_without_a_channel_it_is_refused(folder):
     out = folder / "none"
-    refused(holosplat("forecast", folder / "run", "--model", "assimilate", "--out", out), "assimilate", "--channel")
+    refused(holosplat("forecast", folder / "run", "--by", "assimilate", "--out", out), "assimilate", "--channel")
     assert not out.exists()

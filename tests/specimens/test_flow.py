@@ -119,6 +119,20 @@ def test_both_ways_at_once_and_in_chunks():
     assert torch.allclose(on_first[-1], plain.sum(0))
 
 
+def test_pairs_of_cells_in_parts_are_all_of_them(monkeypatch):
+    """Velocities do not depend on how many pairs of nodes are taken at once; cells touch across the channel's ends."""
+    membrane = Membrane(resting_cell(3))
+    suspension = Suspension(membrane, Channel((20e-6, 19e-6, 23e-6), 0.05))
+    nodes = torch.from_numpy(membrane.mesh.vertices.copy()) + 1e-6 * torch.tensor(
+        [[[1.0, 9.0, 11.0]], [[12.0, 8.0, 8.0]], [[19.5, 9.0, 13.9]]]
+    )
+    whole = suspension.velocity(nodes)
+    monkeypatch.setattr("holosplat.specimens.flow.suspension.pairs_at_a_time", lambda device: 1)
+    monkeypatch.setattr("holosplat.specimens.flow.channel.pairs_at_a_time", lambda device: 1)
+    assert torch.allclose(suspension.velocity(nodes), whole, rtol=1e-12, atol=1e-16)
+    assert contact_forces(nodes, suspension.channel, suspension.repulsion)[[0, 2]].abs().max() > 0
+
+
 def test_repulsion_is_the_energys_slope_and_ends_smoothly():
     repulsion = Repulsion(2e-11, 0.6e-6)
     distance = (torch.tensor([-0.1, 0.01, 0.1, 0.3, 0.59, 0.61]).double() * 1e-6).requires_grad_()

@@ -16,6 +16,8 @@ from ..motion.cell_model import ChannelFrame
 from ..motion.dynamics import DynamicsForecast
 from ..motion.fit import MotionFit
 from ..motion.forecast import PathForecast
+from ..motion.learned import GraphForecast
+from ..motion.modes import ModesForecast
 from ..planning.acts import of_forecast
 from ..ranges import Many, Positive, Seconds, Seed, Signed, Small, ranged
 from ..report.run import report_run
@@ -55,10 +57,14 @@ class ForecastFlags:
     """Times ahead."""
     step: Seconds | None = None
     """Between them [s] (default: the median step of the run)."""
-    model: Literal["auto", "paths", "rigid", "dynamics", "assimilate"] = "auto"
-    """Paths go on, each part of the motion as far as frames tell it; rigid: shapes stay; dynamics: red cells in the
+    by: Literal["auto", "paths", "rigid", "mechanics", "assimilate", "graph", "dmd", "sindy"] = "auto"
+    """Paths go on, each part of the motion as far as frames tell it; rigid: shapes stay; mechanics: red cells in the
     flow of --channel, which their paths over the last times tell; assimilate: the same, fitted to the frames of these
-    times (4D-Var); auto: the mean of paths and dynamics by their errors, or paths without a channel."""
+    times (4D-Var); graph: a network that learnt from red cells in flow; dmd, sindy: modes of each body's own past;
+    auto: with a channel the mean of paths and mechanics by their errors, without one paths, or the network where it
+    tells the last third of the times better."""
+    weights: str = ""
+    """File of the network's weights, as train --network dynamics writes it (default: those of the package)."""
     degree: int = 2
     """Powers of time that are believed, at most."""
     window: int = 0
@@ -88,23 +94,31 @@ class ForecastFlags:
     def options(self) -> ForecastOptions:
         """The options of the forecast."""
         step = 0.0 if self.step is None else positive("--step", self.step, "seconds")
-        model = PathForecast(self.degree, self.window, self.model == "rigid", self.keep_volume)
+        model = PathForecast(self.degree, self.window, self.by == "rigid", self.keep_volume)
         fit = MotionFit()
         steps = max(1, round(positive("--effort", self.effort) * fit.schedule.steps))
         fit = replace(fit, schedule=replace(fit.schedule, steps=steps))
-        return ForecastOptions(self.times, step, model, self._dynamics(), self.half_sets, fit)
+        learned, decides = self._learned(), self.by == "auto"
+        return ForecastOptions(self.times, step, model, self._dynamics(), learned, decides, self.half_sets, fit)
+
+    def _learned(self) -> GraphForecast | ModesForecast | None:
+        if self.by == "dmd" or self.by == "sindy":
+            return ModesForecast(self.by, self.window)
+        if self.by == "graph" or (self.by == "auto" and self.channel is None):
+            return GraphForecast(self.weights, self.window, self.keep_volume)
+        return None
 
     def _dynamics(self) -> DynamicsForecast | None:
         require(
-            self.model not in ("dynamics", "assimilate") or self.channel is not None,
-            f"--model {self.model} needs the channel that cells flow through; say --channel WIDTH HEIGHT [m].",
+            self.by not in ("mechanics", "assimilate") or self.channel is not None,
+            f"--by {self.by} needs the channel that cells flow through; say --channel WIDTH HEIGHT [m].",
         )
-        if self.channel is None or self.model in ("paths", "rigid"):
+        if self.channel is None or self.by not in ("auto", "mechanics", "assimilate"):
             return None
         frame = ChannelFrame(self.channel, self.flow_axis, self.channel_centre)
         peak = (0.0, 0.0) if self.peak is None else _number_or_range("peak", self.peak)
         shear = _number_or_range("shear_modulus", self.shear_modulus)
-        how = {"back": self.back, "mixed": self.model == "auto", "frames": self.model == "assimilate"}
+        how = {"back": self.back, "mixed": self.by == "auto", "frames": self.by == "assimilate"}
         return DynamicsForecast(frame, peak, shear, self.viscosity, **how)
 
 

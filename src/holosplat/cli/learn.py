@@ -83,7 +83,7 @@ def train(
     """Train a network on scenes of `holosplat dataset`: weights with a card, and curves.
 
     That of `--start learned`, or, by --network, those of the methods onix and pixelnerf, which see frames alone, or
-    dynamics, that of `forecast --model graph`, which learns from series of `grow --compact`.
+    dynamics, that of `forecast --by graph`, which learns from series of `grow --compact`.
 
     Args:
         data: Folder of scenes, or of folders of `grow --compact`.

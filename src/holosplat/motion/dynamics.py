@@ -8,7 +8,7 @@ small linear flow about each cell, which then goes on.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -20,7 +20,7 @@ from ..representations import MovingSurfaces
 from ..specimens.flow.suspension import PLASMA_VISCOSITY
 from ..specimens.red_cells import RedCell
 from .cell_model import CellModel, ChannelFrame, Range
-from .forecast import Forecast, Halves, PathForecast, extrapolate, on_paths, places_of, smoothed
+from .forecast import Forecast, Halves, History, Model, PathForecast, extrapolate, on_paths, places_of, smoothed
 from .measures import area
 
 ALIKE = 0.3
@@ -55,6 +55,15 @@ class DynamicsForecast:
     """Whether paths that go on count, too, by the inverse squares of both bands."""
     frames: bool = False
     """Whether the model is fitted to the window's frames, and not to the paths that were fitted to them (4D-Var)."""
+
+    def fit(self, history: History) -> Model:
+        """Mechanics on the history, whose paths go on as usual."""
+
+        def ahead(times: np.ndarray) -> Forecast:
+            found, told = carry(history.bodies, history.times, times, self, GOING_ON, history.halves)
+            return replace(found, told=told)
+
+        return Model(ahead)
 
     def __post_init__(self) -> None:
         in_range("viscosity", self.viscosity, 1e-6, 1e3, unit="pascal seconds")

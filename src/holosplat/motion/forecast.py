@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Protocol
 
 import numpy as np
 from numpy.polynomial import legendre
 from scipy.spatial.transform import Rotation
 
-from ..checks import in_range
+from ..checks import InputError, in_range
+from ..inference import Decision, Score, select
 from ..mesh import TriangleMesh
 from ..ranges import ranged
 from ..representations import MovingSurfaces, TimeBasis
@@ -180,22 +181,61 @@ class PathForecast:
         so many."""
         return times[-max(self.window, self.degree + 1) :] if self.window else times
 
+    def fit(self, history: History) -> Model:
+        """The paths as they go on."""
+        return Model(lambda ahead: extrapolate(history.bodies, history.times, ahead, self, history.halves))
+
 
 @dataclass(frozen=True)
 class Forecast:
     """A forecast after the last frames.
 
     bodies: on paths from the last frames' time on; times: [N] s of the forecast; band: [N, B] m, standard error of each
-    body's surface along its normals (rms over it), NaN where nothing tells it.
+    body's surface along its normals (rms over it), NaN where nothing tells it; told: numbers found on the way.
     """
 
     bodies: MovingSurfaces
     times: np.ndarray
     band: np.ndarray
+    told: dict[str, float] = field(default_factory=dict)
 
     def usual_band(self) -> np.ndarray:
         """[N] m, the median over bodies."""
         return np.sqrt(np.median(self.band**2, axis=1))
+
+
+@dataclass(frozen=True)
+class History:
+    """What a forecast begins with. bodies: fitted to frames at `times` [T] s; halves: fits to two halves of them, which
+    say how far each part of the motion is believed and how uncertain the forecast is."""
+
+    bodies: MovingSurfaces
+    times: np.ndarray
+    halves: Halves | None = None
+
+    def last(self, count: int) -> np.ndarray:
+        """The last `count` times [s] (0: all)."""
+        return self.times[-count:] if count else self.times
+
+
+@dataclass(frozen=True)
+class Model:
+    """A motion that was learnt from a history. ahead: the forecast at later times [N] s."""
+
+    ahead: Callable[[np.ndarray], Forecast]
+
+
+class Forecaster(Protocol):
+    """A way in which bodies go on."""
+
+    @property
+    def kind(self) -> str:
+        """Its name."""
+        ...
+
+    def fit(self, history: History) -> Model:
+        """The motion that the history tells."""
+        ...
 
 
 def extrapolate(
@@ -211,12 +251,51 @@ def extrapolate(
     the forecast is. The band is half of what forecasts from the two differ by, and what a forecast of the window's last
     time from its first two thirds misses beyond that, growing with the square of the time ahead, counted in windows.
     """
-    places, spread = smoothed(bodies, options.times(times), np.r_[times[-1], ahead], options, halves)
-    window = options.times(times)
-    missed, horizon = _backtest(bodies, window, options, halves)
-    growth = ((ahead - times[-1]) / (times[-1] - window[0]) / horizon) ** 2
+
+    def say(
+        of: MovingSurfaces, window: np.ndarray, later: np.ndarray, both: Halves | None
+    ) -> tuple[Places, np.ndarray]:
+        return smoothed(of, window, later, replace(options, window=0), both)
+
+    return told_by(say, bodies, options.times(times), ahead, halves, options.degree)
+
+
+def decided(history: History, paths: PathForecast, other: Forecaster) -> Decision:
+    """Whether bodies go on as `paths` or as the `other` way says: which tells the last third of the times better from
+    those before. Bodies are the blocks of the score; where the other way cannot be asked, paths it is."""
+    early, late = np.split(history.times, [(2 * len(history.times) + 2) // 3])
+    before = History(history.bodies, early, history.halves)
+    truth = places_of(history.bodies, late)
+
+    def score(name: str, fold: int) -> Score:
+        said = (paths if name == paths.kind else other).fit(before).ahead(late)
+        missed = [
+            [(across(one, true, history.bodies.body(k)[1].numpy()) ** 2).mean()]
+            for k, (one, true) in enumerate(zip(places_of(said.bodies, late), truth))
+        ]
+        return Score(np.array(missed))
+
+    by = "the last third of the run's times"
+    try:
+        return select("how bodies go on", (paths.kind, other.kind), score, by=by)
+    except InputError as error:
+        return Decision("how bodies go on", paths.kind, f"{by}; {other.kind} was not asked: {error}")
+
+
+Say = Callable[[MovingSurfaces, np.ndarray, np.ndarray, "Halves | None"], "tuple[Places, np.ndarray]"]
+"""From bodies, the times of a window and later ones [N]: places at these, and what two halves differ by [N, B] [m]."""
+
+
+def told_by(
+    say: Say, bodies: MovingSurfaces, window: np.ndarray, ahead: np.ndarray, halves: Halves | None, degree: int
+) -> Forecast:
+    """The forecast of `say` with the band of `extrapolate`; degree: times of which no forecast can be tested."""
+    last = window[-1]
+    places, spread = say(bodies, window, np.r_[last, ahead], halves)
+    missed, horizon = _backtest(say, bodies, window, halves, degree)
+    growth = ((ahead - last) / (last - window[0]) / horizon) ** 2
     band = np.hypot(spread[1:], growth[:, None] * missed)
-    return Forecast(on_paths(bodies, np.r_[times[-1], ahead], places), ahead, band)
+    return Forecast(on_paths(bodies, np.r_[last, ahead], places), ahead, band)
 
 
 def on_paths(bodies: MovingSurfaces, times: np.ndarray, places: Places) -> MovingSurfaces:
@@ -314,14 +393,14 @@ def of_volume(vertices: np.ndarray, faces: np.ndarray, volume: float) -> np.ndar
 
 
 def _backtest(
-    bodies: MovingSurfaces, times: np.ndarray, options: PathForecast, halves: Halves | None
+    say: Say, bodies: MovingSurfaces, times: np.ndarray, halves: Halves | None, degree: int
 ) -> tuple[np.ndarray, float]:
     """Error of a forecast of the last time from the first two thirds for each body [B] m beyond its noise, together
     with the median of all, and how far ahead it looked, in its own windows; NaN for fewer times than it needs."""
     early = times[: (2 * len(times) + 2) // 3]
-    if len(early) <= options.degree or len(early) == len(times):
+    if len(early) <= degree or len(early) == len(times):
         return np.full(bodies.count, np.nan), 1.0
-    said, spread = smoothed(bodies, early, times[-1:], replace(options, window=0), halves)
+    said, spread = say(bodies, early, times[-1:], halves)
     squares = np.zeros(bodies.count)
     for k, (one, other) in enumerate(zip(said, places_of(bodies, times[-1:]))):
         missed = across(one, other, bodies.body(k)[1].numpy())[0]

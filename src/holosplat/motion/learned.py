@@ -32,7 +32,7 @@ from ..ranges import Natural, ranged
 from ..representations import MovingSurfaces
 from ..specimens.flow.suspension import PLASMA_VISCOSITY
 from ..specimens.membrane.model import Elasticity
-from .forecast import Forecast, Halves, across, of_volume, on_paths, places_of
+from .forecast import Forecast, Halves, History, Model, across, of_volume, on_paths, places_of
 
 SHIPPED = Path(__file__).with_name("flowing_cells.safetensors")
 VERSION = "dynamics 1"
@@ -294,6 +294,10 @@ class GraphForecast:
     keep_volume: bool = True
     """Whether bodies keep the mean volume of the window."""
 
+    def fit(self, history: History) -> Model:
+        """The network on the history."""
+        return Model(lambda ahead: learned(history.bodies, history.times, ahead, self, history.halves))
+
 
 def learned(
     bodies: MovingSurfaces,
@@ -310,13 +314,13 @@ def learned(
     known = times[-max(options.window, DEGREE + 2) :] if options.window else times
     require(
         len(known) > DEGREE + 1,
-        f"the network must see {DEGREE + 2} times at least, but the run has {len(known)}; take --model paths.",
+        f"the network must see {DEGREE + 2} times at least, but the run has {len(known)}; take --by paths.",
     )
     length = float(known[-1] - known[0])
     require(
         ahead[-1] - known[-1] <= LONGEST * length * (1 + 1e-9),
         f"the network was trained on horizons of up to {LONGEST:g} windows, but {ahead[-1] - known[-1]:.4g} s are "
-        f"asked for after a window of {length:.4g} s; ask for fewer --times, or take --model paths.",
+        f"asked for after a window of {length:.4g} s; ask for fewer --times, or take --by paths.",
     )
     trained = read_dynamics(Path(options.weights)) if options.weights else read_dynamics()
     places = places_of(bodies, known)

@@ -45,7 +45,7 @@ def dressed(meshes: Sequence[TriangleMesh], membrane: Membrane) -> np.ndarray:
     found = np.array([_on_surface(mesh, membrane) for mesh in meshes])
     require(
         bool(np.isfinite(found).all()),
-        "membranes must fit the tracked surfaces, but one does not; track more times or beams, or use --model paths.",
+        "membranes must fit the tracked surfaces, but one does not; track more times or beams, or use --by paths.",
     )
     return found
 

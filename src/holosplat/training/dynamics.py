@@ -35,6 +35,8 @@ from ..motion.learned import (
 from .shown import FILE
 from .train import WEIGHTS, Training
 
+SIZE = DynamicsSize()
+"""Of the network."""
 WINDOWS = (12, 16, 20, 24)
 """Snapshots of a window."""
 BODIES = 48
@@ -186,14 +188,14 @@ def _noise(whole: Tensor, normals: Tensor, noise: float, rng: np.random.Generato
 
 
 class DynamicsTraining(Training):
-    """A training of the network of `--model graph`: the likelihood of where nodes are later, across surfaces."""
+    """A training of the network of `--by graph`: the likelihood of where nodes are later, across surfaces."""
 
     columns: ClassVar[tuple[str, ...]] = ("step", "loss", "missed", "thought", "rate")
 
     data: FlowSeries  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def _made(self) -> nn.Module:
-        return Dynamics()
+        return Dynamics(SIZE)
 
     def _value(self, sample: Series, rng: np.random.Generator) -> tuple[Tensor, list[float]]:  # pyright: ignore[reportIncompatibleMethodOverride]
         assert isinstance(self.network, Dynamics)
@@ -209,8 +211,10 @@ class DynamicsTraining(Training):
     def finish(self, validation: DynamicsValidation, made_by: dict[str, str]) -> Path:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Write the weights with their card; their file."""
         assert isinstance(self.network, Dynamics)
-        path = self.folder / WEIGHTS
-        write_dynamics(path, self.network, validation.card(self.network, self.data.ranges, made_by))
+        path, how = self.folder / WEIGHTS, self.options
+        card = validation.card(self.network, self.data.ranges, made_by)
+        said = {"steps": how.steps, "rate": how.rate, "seed": how.seed, "bodies": BODIES}
+        write_dynamics(path, self.network, replace(card, training=said))
         return path
 
 
@@ -259,10 +263,10 @@ class DynamicsValidation:
         """What `network` scores here, and what its standard errors are to be multiplied by."""
         self.judge(network, 0)
         rows = [self.rows.pop() for _ in range(len(ASKED) * len(NOISES))][::-1]
-        scores = {
-            f"{noise:g} radii, {ahead} ahead": {"missed": missed, "thought": thought, "quadratic": quadratic}
-            for _, noise, ahead, missed, thought, quadratic in rows
-        }
+        scores: dict[str, dict[str, float]] = {}
+        for _, noise, ahead, missed, thought, quadratic in rows:
+            said = {"missed": missed, "thought": thought, "quadratic": quadratic}
+            scores.setdefault(str(ahead), {}).update({f"{name}, noise {noise:g}": v for name, v in said.items()})
         ratio = float(np.sqrt(np.mean([(missed / thought) ** 2 for *_, missed, thought, _ in rows])))
         words = (
             "It knows red cells of healthy moduli in dilute suspension in straight channels, in windows of 12 to 24 "
@@ -304,6 +308,3 @@ def train_dynamics(
     told = DynamicsValidation(data.validation())
     training.run(told, on_step)  # pyright: ignore[reportArgumentType]
     return training.finish(told, who), told
-
-
-__all__ = ["DynamicsSize", "FlowSeries", "train_dynamics"]

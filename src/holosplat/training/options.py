@@ -89,7 +89,7 @@ class TrainOptions:
     """The training loss."""
     network: Literal["start", "onix", "pixelnerf", "dynamics"] = "start"
     """What is trained: the network of `--start learned`, or those of the methods `onix` and `pixelnerf`, which learn
-    from frames alone, or that of `forecast --model graph`, on series of grow; these are of one size."""
+    from frames alone, or that of `forecast --by graph`, on series of grow; these are of one size."""
     frames: FrameLossWeights = field(default_factory=FrameLossWeights)
     """The training loss of networks that learn from frames alone."""
 

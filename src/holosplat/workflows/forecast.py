@@ -10,6 +10,7 @@ import torch
 
 from ..checks import InputError, as_written, positive, require
 from ..fit.run import Journal, Run
+from ..inference import Decision
 from ..io.atomic import write_rows
 from ..io.json import write_json
 from ..io.nxtomo import write_scan
@@ -19,8 +20,10 @@ from ..metrics import image_scores, intensity_range
 from ..motion.assimilate import carry_by_frames
 from ..motion.dynamics import DynamicsForecast, carry, window_of
 from ..motion.fit import MotionFit
-from ..motion.forecast import Forecast, Halves, PathForecast, extrapolate
+from ..motion.forecast import Forecast, Halves, History, PathForecast, decided
+from ..motion.learned import GraphForecast
 from ..motion.measures import LEAST, half_sets
+from ..motion.modes import ModesForecast
 from ..optics.background import Light
 from ..progress import FitProgress
 from ..ranges import Many, Seconds, ranged
@@ -58,6 +61,10 @@ class ForecastOptions:
     """How paths go on."""
     dynamics: DynamicsForecast | None = None
     """How cells go on by mechanics (default: all bodies go on their paths)."""
+    learned: GraphForecast | ModesForecast | None = None
+    """How bodies go on by what was learnt, and not on their paths."""
+    decides: bool = False
+    """Whether paths decide against what was learnt, by the last third of the run's times."""
     half_sets: bool = True
     """Whether paths are fitted again to two halves of the times, which say what is believed of the motion."""
     fit: MotionFit = field(default_factory=MotionFit)
@@ -69,6 +76,11 @@ class ForecastOptions:
             f"a forecast must be of 1 to {MOST_TIMES} times, but {self.times} are asked for; change --times.",
         )
 
+    @property
+    def way(self) -> str:
+        """Name of how bodies go on."""
+        return (self.dynamics or self.learned or self.model).kind
+
     def ahead(self, tracked: np.ndarray) -> np.ndarray:
         """Times [N] s of the forecast after those of the run, `tracked` [T] s."""
         step = self.step or float(np.median(np.diff(tracked)))
@@ -78,18 +90,22 @@ class ForecastOptions:
 @dataclass(frozen=True)
 class Forecasted:
     """What `forecast` found. forecast: bodies and band; predicted: the frames at its times; judged: scores against the
-    frames that the run did not see, a row a time, empty without such frames; flow: what mechanics found of it."""
+    frames that the run did not see, a row a time, empty without such frames; flow: what mechanics found of it;
+    decision: between paths and what was learnt."""
 
     forecast: Forecast
     predicted: Scan
     judged: list[dict[str, float]]
     flow: dict[str, float] = field(default_factory=dict)
+    decision: Decision | None = None
 
     def lines(self) -> list[str]:
         """The numbers as a few lines of text."""
         step, last = self.forecast.times[0], self.forecast.times[-1]
         band = 1e6 * self.forecast.usual_band()
         said = [f"standard error of surfaces: {band[0]:.3f} µm at {step:.4g} s, {band[-1]:.3f} µm at {last:.4g} s"]
+        if self.decision is not None:
+            said.append(self.decision.line)
         if self.flow:
             said.append(flow_in_words(self.flow))
         if self.judged:
@@ -141,8 +157,13 @@ def forecast(
     halves = _halves(run, known, bodies, options, seed, Run(journal), on_progress) if options.half_sets else None
     on_progress("forecast", 0.0, {})
     flow = dict[str, float]()
+    decision = None
     if options.dynamics is None:
-        found = extrapolate(bodies, times, ahead, options.model, halves)
+        history, way = History(bodies, times, halves), options.learned or options.model
+        if options.learned is not None and options.decides:
+            decision = decided(history, options.model, options.learned)
+            way = options.learned if decision.choice == options.learned.kind else options.model
+        found = way.fit(history).ahead(ahead)
     elif options.dynamics.frames:
         window = window_of(bodies, times, ahead, options.dynamics, options.model, halves)
         found, flow = carry_by_frames(window, _evened(run, known)[0], run.oversample)
@@ -150,10 +171,8 @@ def forecast(
         found, flow = carry(bodies, times, ahead, options.dynamics, options.model, halves)
     exposures = scan.exposures[last].repeated(ahead)
     frames = render_object(found.bodies, exposures, run.oversample, bodies.backend)
-    predicted = Scan(
-        frames, exposures, np.zeros(len(frames), dtype=bool), {"forecast": (options.dynamics or options.model).kind}
-    )
-    return Forecasted(found, predicted, _judged(found, run, scan, known, slack), flow)
+    predicted = Scan(frames, exposures, np.zeros(len(frames), dtype=bool), {"forecast": options.way})
+    return Forecasted(found, predicted, _judged(found, run, scan, known, slack), flow, decision)
 
 
 def flow_in_words(flow: dict[str, float]) -> str:
@@ -189,7 +208,13 @@ def write_forecast(folder: RunFolder, run: Reconstruction, found: Forecasted) ->
     band = [None if np.isnan(one) else float(one) for one in said.usual_band()]
     write_json(
         folder.path / NUMBERS,
-        {"times_s": said.times.tolist(), "band_m": band, "held_out": found.judged, "flow": found.flow},
+        {
+            "times_s": said.times.tolist(),
+            "band_m": band,
+            "held_out": found.judged,
+            "flow": found.flow,
+            "decision": found.decision and found.decision.as_dict(),
+        },
     )
     write_tracks(folder, said.bodies, found.predicted)
     return done
@@ -210,7 +235,7 @@ def config_of(options: ForecastOptions, scan: Scan, run: dict[str, Any], seed: i
     return {
         "schema_version": SCHEMA,
         "method": {
-            **{"kind": options.kind, "of": run.get(RUN, ""), "forecast": (options.dynamics or options.model).kind},
+            **{"kind": options.kind, "of": run.get(RUN, ""), "forecast": options.way},
             **to_table(options),
         },
         "seed": seed,

@@ -1,0 +1,166 @@
+"""Bodies go on by what their own past tells alone: dynamic mode decomposition, and sparse identification.
+
+Both act on a body's nodes about its middle, at even times; the middle goes on by a parabola. DMD (Schmid 2010, J. Fluid
+Mech. 656, 5) with delays (Arbabi & Mezić 2017, SIAM J. Appl. Dyn. Syst. 16, 2096) is PyDMD's, SINDy (Brunton, Proctor &
+Kutz 2016, PNAS 113, 3932), on principal components of the shapes, is PySINDy's; both come with the extra `dynamics`.
+"""
+
+from __future__ import annotations
+
+import importlib
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from ..checks import MissingError, require
+from ..inference import Decision, Score, select
+from ..representations import MovingSurfaces
+from .forecast import Forecast, Halves, History, Model, Places, across, places_of, told_by
+
+ORDERS: dict[str, tuple[tuple[int, int], ...]] = {
+    "dmd": ((2, 2), (3, 2), (4, 2), (4, 4), (6, 4)),
+    "sindy": ((2, 1), (3, 1), (3, 2)),
+}
+"""Rank and number of delays, and number of shape modes and degree of their polynomials, from simple to complex."""
+MIDDLE = 2
+"""Degree of the middle's path."""
+LEAST = 9
+"""Times that are needed: the first two thirds of them must hold the delays, and tell a parabola."""
+SUBSTEPS, FAR = 2, 1e3
+"""Steps from one time to the next, and how far from shapes that were seen, in their size, equations have run away."""
+SPARSE = 0.05
+"""Coefficients of SINDy that are smaller, where shapes and times are of order one, are left out."""
+
+
+@dataclass(frozen=True)
+class ModesForecast:
+    """How bodies move on by modes of their own past."""
+
+    by: Literal["dmd", "sindy"] = "dmd"
+    """Which method."""
+    window: int = 0
+    """Last times of the run that it sees (0: all)."""
+
+    @property
+    def kind(self) -> str:
+        """Its name."""
+        return self.by
+
+    def fit(self, history: History) -> Model:
+        """What the past tells; `InputError` for fewer than `LEAST` times, `MissingError` without the extra."""
+        window = history.last(self.window)
+        require(
+            len(window) >= LEAST,
+            f"--by {self.by} must see {LEAST} times at least, but the run has {len(window)}; take --by paths.",
+        )
+        one = _dmd if self.by == "dmd" else _sindy
+        order = self.decided(history.bodies, window)
+        chosen = next(each for each in ORDERS[self.by] if str(each) == order.choice)
+
+        def say(
+            bodies: MovingSurfaces, times: np.ndarray, ahead: np.ndarray, halves: Halves | None
+        ) -> tuple[Places, np.ndarray]:
+            found = _places(bodies, times, ahead, chosen, one)
+            spread = np.zeros((len(ahead), bodies.count))
+            if halves is not None:
+                both = [_places(half, times, ahead, chosen, one) for half in halves]
+                for k, (first, second) in enumerate(zip(*both)):
+                    spread[:, k] = 0.5 * across(first, second, bodies.body(k)[1].numpy())
+            return found, spread
+
+        def ahead(times: np.ndarray) -> Forecast:
+            return told_by(say, history.bodies, window, times, history.halves, MIDDLE)
+
+        return Model(ahead)
+
+    def decided(self, bodies: MovingSurfaces, window: np.ndarray) -> Decision:
+        """The order that tells the last third of the window best from what is before, over all bodies."""
+        early, late = np.split(window, [(2 * len(window) + 2) // 3])
+        truth = places_of(bodies, late)
+        one = _dmd if self.by == "dmd" else _sindy
+        kept = dict[str, Score]()
+
+        def score(name: str, fold: int) -> Score:
+            if name not in kept:
+                order = next(each for each in ORDERS[self.by] if str(each) == name)
+                said = _places(bodies, early, late, order, one)
+                kept[name] = Score(np.array([[((a - b) ** 2).mean()] for a, b in zip(said, truth)]))
+            return kept[name]
+
+        names = [str(each) for each in ORDERS[self.by]]
+        return select("order of the modes", names, score, by="the last third of the run's times")
+
+
+Ahead = Callable[[np.ndarray, int, tuple[int, int]], np.ndarray]
+"""Of snapshots [T, F] the next ones [N, F], by an order."""
+
+
+def _places(bodies: MovingSurfaces, times: np.ndarray, ahead: np.ndarray, order: tuple[int, int], one: Ahead) -> Places:
+    """Places of each body at the times `ahead` [N] by its past at as many even times as `times` has."""
+    even = np.linspace(times[0], times[-1], len(times))
+    step = even[1] - even[0]
+    more = int(np.ceil((ahead[-1] - times[-1]) / step - 1e-9))
+    found = []
+    for places in places_of(bodies, even):
+        middle = places.mean(1)
+        parabola = np.polynomial.Polynomial.fit
+        moved = np.stack([parabola(even, x, MIDDLE)(ahead) for x in middle.T], axis=1)
+        flat = (places - middle[:, None]).reshape(len(even), -1)
+        scores, size, basis = np.linalg.svd(flat, full_matrices=False)  # T numbers say what all the nodes do
+        scale = size[0] / np.sqrt(len(flat))
+        later = scale * one(scores * size / scale, max(more, 1), order) @ basis
+        path = CubicSpline(times[-1] + step * np.arange(-1, max(more, 1) + 1), np.r_[flat[-2:], later])
+        found.append(path(ahead).reshape(len(ahead), -1, 3) + moved[:, None])
+    return found
+
+
+def _dmd(past: np.ndarray, count: int, order: tuple[int, int]) -> np.ndarray:
+    rank, delays = order
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of condition numbers, which delays raise
+        found = _library("pydmd").HankelDMD(svd_rank=rank, d=delays)
+        found.fit(past.T)
+        found.dmd_time["tend"] = len(past) - 1 + count
+        said = np.asarray(found.reconstructed_data).T.real
+    return said[-count:]
+
+
+def _sindy(past: np.ndarray, count: int, order: tuple[int, int]) -> np.ndarray:
+    """Where the equations run away, the last shape stays. They are integrated by Runge and Kutta's method."""
+    modes, degree = order
+    mean = past.mean(0)
+    left, size, right = np.linalg.svd(past - mean, full_matrices=False)
+    scores, basis = left[:, :modes] * size[:modes], right[:modes]
+    scale = np.abs(scores).max()
+    sindy = _library("pysindy")
+    step = 1 / (len(past) - 1)
+    library = sindy.PolynomialLibrary(degree=degree)
+    model = sindy.SINDy(optimizer=sindy.STLSQ(threshold=SPARSE), feature_library=library)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of libraries that are left empty
+        model.fit(scores / scale, t=step)
+        state, said = scores[-1] / scale, list[np.ndarray]()
+        for _ in range(count * SUBSTEPS):
+            state = _advanced(lambda x: np.asarray(model.predict(x[None]))[0], state, step / SUBSTEPS)
+            if not np.abs(state).max() < FAR:
+                return np.repeat(past[-1:], count, axis=0)
+            said.append(state)
+    return past[-1] + (scale * np.array(said[SUBSTEPS - 1 :: SUBSTEPS]) - scores[-1]) @ basis
+
+
+def _advanced(slope: Callable[[np.ndarray], np.ndarray], state: np.ndarray, step: float) -> np.ndarray:
+    first = slope(state)
+    second = slope(state + 0.5 * step * first)
+    third = slope(state + 0.5 * step * second)
+    return state + step / 6 * (first + 2 * second + 2 * third + slope(state + step * third))
+
+
+def _library(name: str) -> Any:
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        raise MissingError(f"this forecast needs {name}: pip install 'holosplat[dynamics]'.") from None
