@@ -102,15 +102,15 @@ def test_adam_is_that_of_the_reference(count, gpu):
 
 @pytest.mark.parametrize(("count", "launches"), [(0, 0), (1, 1), (4, 1), (5, 2), (12, 3)])
 def test_one_launch_moves_up_to_four_arrays(count, launches, gpu, monkeypatch):
-    from holosplat.fit.adam import triton_adam
+    from holosplat.fit.adam import cuda
 
-    sizes, usual = [], triton_adam._launch
+    sizes, usual = [], cuda._launch
 
     def noted(arrays, factors):
         sizes.append(len(arrays))
         usual(arrays, factors)
 
-    monkeypatch.setattr(triton_adam, "_launch", noted)
+    monkeypatch.setattr(cuda, "_launch", noted)
     arrays = [[torch.ones(3, device=gpu) for _ in range(count)] for _ in range(4)]
     adam.step(*arrays, adam.factors([0.1] * count, 1, 1e-12).to(gpu), backend="cuda")
     assert len(sizes) == launches

@@ -1,16 +1,22 @@
-"""Products with slice matrices on the GPU, in float32: the Triton kernel beside this file.
+"""Products with slice matrices on the GPU, in float32: a sparse matrix times a dense array, gathered row by row.
 
 Sums run in a fixed order: results are bitwise the same in every run. Nothing waits for the device.
 """
 
+# pyright: reportGeneralTypeIssues=false, reportOperatorIssue=false, reportAttributeAccessIssue=false
+# pyright: reportCallIssue=false, reportIndexIssue=false, reportArgumentType=false, reportOptionalMemberAccess=false
 from __future__ import annotations
 
 from collections.abc import Callable
 
+import triton
+import triton.language as tl
 from torch import Tensor
 
 from ....launch import launching
-from . import triton_slices
+
+BLOCK, WARPS = 128, 1
+"""Columns of the dense array that a program takes, and its warps."""
 
 
 class Products:
@@ -31,5 +37,25 @@ class Products:
 
 
 def _product(entries: tuple[Tensor, Tensor, Tensor], dense: Tensor) -> Tensor:
+    """[M, S] of a matrix [M, N] and a dense array [N, S].
+
+    entries: of the matrix: starts of rows (int64), columns (int64) and values (float32).
+    """
+    dense = dense.detach().float().contiguous()
+    rows, count = len(entries[0]) - 1, dense.shape[1]
+    out = dense.new_empty(rows, count)
+    grid = (rows, triton.cdiv(count, BLOCK))
     with launching(dense):
-        return triton_slices.product(entries, dense.detach().float().contiguous())
+        _multiply[grid](*entries, dense, out, count, BLOCK, num_warps=WARPS)
+    return out
+
+
+@triton.jit(do_not_specialize=["S"])
+def _multiply(starts, columns, values, dense, out, S, BLOCK: tl.constexpr):
+    row = tl.program_id(0).to(tl.int64)
+    s = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
+    there = s < S
+    sum = tl.zeros((BLOCK,), tl.float32)
+    for k in range(tl.load(starts + row), tl.load(starts + row + 1)):
+        sum += tl.load(values + k) * tl.load(dense + tl.load(columns + k) * S + s, mask=there, other=0.0)
+    tl.store(out + row * S + s, sum, mask=there)
