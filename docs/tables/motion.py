@@ -159,6 +159,28 @@ SEEN = ("splines", "paths", "auto")
 """Ways whose frames are scored in the table."""
 
 
+@table("forecast-learned", FORECAST, "an hour", "forecast.csv")
+def learned_forecasts() -> str:
+    """What was learnt beside paths and mechanics, of each case in which the network was asked."""
+    rows, parts = read("forecast.csv"), []
+    for case in dict.fromkeys(row["case"] for row in rows if row["model"] == "graph"):
+        found = _by_model(rows, case)
+        models = [model for model in LEARNED if model in found]
+        lines = [[ahead, *(_miss(found[m].get(ahead, NONE)) for m in models)] for ahead in _aheads(found)]
+        parts.append(f"*{_named(case)}*\n\n" + markdown(("times ahead", *(LEARNED[m] for m in models)), lines))
+    return "\n\n".join(parts)
+
+
+LEARNED = {
+    "splines": "splines of vertices",
+    "paths": "paths",
+    "dynamics": "mechanics",
+    "graph": "graph network",
+    "dmd": "DMD",
+    "sindy": "SINDy",
+}
+
+
 @table("forecast-mechanics", FORECAST, "an hour", "forecast.csv")
 def mechanics() -> str:
     """The modulus found, and a wrong one, without a flow beside each cell."""
