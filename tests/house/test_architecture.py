@@ -46,7 +46,11 @@ SAME_TIER = dict.fromkeys(TIERS[0], TIERS[0])
 """Rooms of their own tier that a room may import (the nouns among themselves: without cycles)."""
 
 BACKENDS = ("*/cpu.py", "*/cuda.py", "*/reference.py")
-BACKEND_IMPORTS = {"projectors/mesh/reference.py": ("geometry",), "optics/hologram/reference.py": ("optics",)}
+BACKEND_IMPORTS = {
+    "projectors/mesh/reference.py": ("geometry",),
+    "optics/hologram/reference.py": ("optics",),
+    "baselines/tv_steps/cuda.py": ("projectors",),
+}
 """What a backend file may import of ours, beside its own folder and `native`."""
 
 HEAVY: dict[str, tuple[str, ...]] = {

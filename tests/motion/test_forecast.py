@@ -16,10 +16,10 @@ from holosplat.checks import InputError
 from holosplat.fit.run import Run
 from holosplat.fit.schedule import Schedule
 from holosplat.matter import Matter
-from holosplat.mesh import TriangleMesh
+from holosplat.mesh import TriangleMesh, across, normals
 from holosplat.metrics.volumes import normal_distance
 from holosplat.motion.fit import MotionFit
-from holosplat.motion.forecast import PathForecast, across, extrapolate, normals
+from holosplat.motion.forecast import PathForecast, extrapolate
 from holosplat.motion.measures import half_sets
 from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.specimens.red_cells import icosphere

@@ -32,7 +32,6 @@ from holosplat.motion.learned import (
     learned,
     spread_nodes,
     spread_of,
-    turned,
     write_dynamics,
 )
 from holosplat.representations import MovingSurfaces, TimeBasis
@@ -66,6 +65,12 @@ def a_scene(seed: int = 0) -> Scene:
     middle[:, 0] = torch.tensor([[0.0, 0, 0], [2.4, 0, 0], [40.0, 0, 0]]) - middle[:, 1:].sum(1)
     normals = torch.nn.functional.normalize(own.sum(2), dim=-1)
     return Scene.of(own, middle, normals, torch.full((3,), 0.4).double(), torch.full((3,), 0.01).double())
+
+
+def turned(scene: Scene, rotation: torch.Tensor) -> Scene:
+    """The same scene turned by `rotation` [3, 3]."""
+    own, middle, normals = (x @ rotation.mT for x in (scene.own, scene.middle, scene.normals))
+    return replace(scene, own=own, middle=middle, normals=normals)
 
 
 @pytest.mark.parametrize("mirrored", [False, True], ids=["turned", "mirrored"])

@@ -11,13 +11,12 @@ import torch
 from torch import Tensor
 
 from ..checks import InputError, positive
-from ..mesh import TriangleMesh
+from ..mesh import TriangleMesh, areas, normals
 from ..ranges import Signed, Small, ranged
 from ..specimens.flow.channel import Channel
 from ..specimens.flow.suspension import Medium
 from ..specimens.membrane.model import Elasticity, Membrane
 from ..specimens.membrane.resting import resting_cell
-from .forecast import areas, normals
 from .membrane_fit import Bound, CellFlow, Unknowns, Velocity, advanced, dressed, scaled
 
 ENDLESS = 1e-3

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from ..checks import InputError, in_range
 from ..inference import Decision, Score, select
-from ..mesh import TriangleMesh
+from ..mesh import TriangleMesh, across, areas
 from ..ranges import ranged
 from ..representations import MovingSurfaces, TimeBasis
 from ..representations.paths import path_positions
@@ -315,32 +315,6 @@ def places_of(bodies: MovingSurfaces, times: np.ndarray) -> Places:
         [path_positions(bodies.basis, bodies.coefficients.detach(), float(time)).numpy() for time in times]
     )
     return [bodies.unit_length * whole[:, bodies.body(k)[0].numpy()] for k in range(bodies.count)]
-
-
-def areas(mesh: TriangleMesh) -> np.ndarray:
-    """[P] m² around each vertex: a third of its triangles."""
-    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
-    found = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1) / 3
-    return np.bincount(mesh.faces.ravel(), np.repeat(found, 3), minlength=len(mesh.vertices))
-
-
-def normals(mesh: TriangleMesh) -> np.ndarray:
-    """[P, 3] outward unit normals at the vertices, means of those of their triangles by area."""
-    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
-    found, across = np.zeros_like(mesh.vertices), np.cross(b - a, c - a)
-    for corner in range(3):
-        np.add.at(found, mesh.faces[:, corner], across)
-    return found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), np.finfo(float).tiny)
-
-
-def across(places: np.ndarray, others: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """[T] m: root-mean-square distance of two sets of places [T, P, 3] of a body's vertices along its normals."""
-    found = []
-    for one, other in zip(places, others):
-        mesh = TriangleMesh(one, faces)
-        along_normals = ((other - one) * normals(mesh)).sum(1)
-        found.append(np.sqrt(np.average(along_normals**2, weights=areas(mesh))))
-    return np.array(found)
 
 
 def smoothed(

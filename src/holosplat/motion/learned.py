@@ -12,7 +12,7 @@ is given by Legendre polynomials of degree `DEGREE`, which paths of flowing cell
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
@@ -27,15 +27,14 @@ from torch import Tensor, nn
 from ..checks import InputError, as_written, require
 from ..io.atomic import atomic_path
 from ..learning.weights import Card, card_of, size_of, tensors_of
-from ..mesh import TriangleMesh
+from ..mesh import TriangleMesh, across
 from ..ranges import Natural, ranged
 from ..representations import MovingSurfaces
 from ..specimens.flow.suspension import PLASMA_VISCOSITY
 from ..specimens.membrane.model import Elasticity
-from .forecast import Forecast, Halves, History, Model, across, of_volume, on_paths, places_of
+from .forecast import Forecast, Halves, History, Model, of_volume, on_paths, places_of
 
-SHIPPED = Path(__file__).with_name("flowing_cells.safetensors")
-VERSION = "dynamics 1"
+SHIPPED, VERSION = Path(__file__).with_name("flowing_cells.safetensors"), "dynamics 1"
 DEGREE = 4
 """Of the polynomials of the window: what paths of flowing cells over 24 µm of way leave is a nanometre."""
 POWERS = 5
@@ -52,9 +51,8 @@ LEAST_SPREAD = 1e-4
 """Standard error [radii] of which a node is always thought."""
 RELAXATION = PLASMA_VISCOSITY / Elasticity().skalak_shear
 """Viscosity over shear modulus of healthy cells [s/m]: times a radius, the time in which a shape relaxes."""
-CHANNELS = 2 * DEGREE + 2
+CHANNELS, SCALARS = 2 * DEGREE + 2, 3
 """Vectors of a node: its own coefficients about the body's middle, the middle's without its place, the normal."""
-SCALARS = 3
 QUICK = 0.1
 """Scale of the middle's coefficients, which go many radii in a window."""
 
@@ -388,7 +386,7 @@ class State:
 
 
 def _scene(states: list[State], length: float) -> tuple[Scene, Tensor]:
-    """What the network sees, and the radii [B] [m]. Bodies with fewer nodes than others repeat some."""
+    """What the network sees, and the radii [B] [m]; of bodies with few nodes, some are repeated."""
     radii = torch.tensor([one.radius for one in states], dtype=torch.float64)
     count = max(len(one.nodes) for one in states)
     chosen = [np.resize(one.nodes, count) for one in states]
@@ -400,9 +398,3 @@ def _scene(states: list[State], length: float) -> tuple[Scene, Tensor]:
     noise = torch.tensor([one.noise for one in states], dtype=torch.float64)
     parts = own, middle, normals, length / (RELAXATION * radii), noise
     return Scene.of(*(part.float() for part in parts)), radii
-
-
-def turned(scene: Scene, rotation: Tensor) -> Scene:
-    """The same scene turned by `rotation` [3, 3]."""
-    own, middle, normals = (x @ rotation.mT for x in (scene.own, scene.middle, scene.normals))
-    return replace(scene, own=own, middle=middle, normals=normals)

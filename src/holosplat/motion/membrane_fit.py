@@ -24,11 +24,10 @@ from torch.utils.checkpoint import checkpoint
 
 from ..bodies.rest_shape import moments, stretched_like
 from ..checks import require
-from ..mesh import TriangleMesh
+from ..mesh import TriangleMesh, areas, normals
 from ..specimens.flow.channel import Channel, contact_forces, wall_forces
 from ..specimens.flow.suspension import Medium, Suspension
 from ..specimens.membrane.model import Elasticity, Membrane
-from .forecast import areas, normals
 from .measures import area
 
 STIFFNESS = (1e-6, 3e-6, 1e-5, 3e-5, 1e-4, 1e-4, 1e-4)

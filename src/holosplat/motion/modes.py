@@ -18,8 +18,9 @@ from scipy.interpolate import CubicSpline
 
 from ..checks import MissingError, require
 from ..inference import Decision, Score, select
+from ..mesh import across
 from ..representations import MovingSurfaces
-from .forecast import Forecast, Halves, History, Model, Places, across, places_of, told_by
+from .forecast import Forecast, Halves, History, Model, Places, places_of, told_by
 
 ORDERS: dict[str, tuple[tuple[int, int], ...]] = {
     "dmd": ((2, 2), (3, 2), (4, 2), (4, 4), (6, 4)),

@@ -86,7 +86,7 @@ class FlowSeries:
 
     @classmethod
     def read(cls, folder: Path, device: str = "cpu") -> FlowSeries:
-        """All series in `folder`; `InputError` where there are not two."""
+        """All series in `folder`; `InputError` for fewer than two."""
         found = tuple(sorted(path.parent for path in folder.glob("*/grow.json")))
         require(
             len(found) > 1, f"{folder} must hold folders of holosplat grow --compact, two at least, but it does not."
@@ -143,8 +143,17 @@ class Lesson:
         return (missed * self.normals).sum(-1).square(), missed.square().sum(-1), spread_of(spread, self.horizon)
 
 
-def lesson(series: Series, first: int, window: int, stride: int, horizons: np.ndarray, noise: float, cells: slice,
-           rng: np.random.Generator) -> Lesson:  # fmt: skip
+def lesson(
+    series: Series,
+    first: int,
+    window: int,
+    stride: int = 1,
+    *,
+    horizons: np.ndarray,
+    noise: float,
+    cells: slice,
+    rng: np.random.Generator,
+) -> Lesson:
     """A window from snapshot `first` on, in `window` steps of `stride`, and the snapshots `horizons` after it."""
     past = first + stride * np.arange(window)
     ahead = past[-1] + horizons
@@ -229,7 +238,8 @@ def draw_lesson(series: Series, rng: np.random.Generator) -> Lesson:
     horizons = np.sort(rng.integers(1, most + 1, HORIZONS))
     noise = 0.0 if rng.random() < EXACT else float(np.exp(rng.uniform(*np.log(NOISE))))
     start = int(rng.integers(max(1, series.nodes.shape[1] - BODIES + 1)))
-    return lesson(series, first, window, stride, horizons, noise, slice(start, start + BODIES), rng)
+    cells = slice(start, start + BODIES)
+    return lesson(series, first, window, stride, horizons=horizons, noise=noise, cells=cells, rng=rng)
 
 
 @dataclass
@@ -282,7 +292,8 @@ def _judged(network: Dynamics, series: Series, noise: float) -> np.ndarray:
     firsts = range(0, len(series.times) - max(WINDOWS) - max(ASKED), 8)
     found = []
     for first in firsts:
-        drawn = lesson(series, first, max(WINDOWS), 1, np.array(ASKED), noise, slice(0, BODIES), rng)
+        how = {"horizons": np.array(ASKED), "noise": noise, "cells": slice(0, BODIES), "rng": rng}
+        drawn = lesson(series, first, max(WINDOWS), **how)
         across, _, thought = drawn.errors(network)
         found.append([across.mean((0, 1)), thought.square().mean((0, 1)), _quadratic(drawn)])
     return np.array([[part.cpu().numpy() for part in row] for row in found]).mean(0)
