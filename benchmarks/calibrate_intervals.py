@@ -4,7 +4,7 @@
     python benchmarks/calibrate_intervals.py --summary        # factors of the package, and coverage by family
 
 Scenes are those of `family_scenes`, in turn of every simulated family, on pixels joined 2 × 2 (23 to 30 of them along
-an edge), of 3 to 12 views, reconstructed by linear retrieval or by retrieval of all views with total variation. A run's
+an edge), of 3 to 8 views, reconstructed by linear retrieval or by retrieval of all views with total variation. A run's
 errors against the truth stand beside what its rehearsals say of them. Every second scene is also run with a mistake in
 what is said of it: then only the residual over that of the rehearsals counts.
 
@@ -49,7 +49,7 @@ DATA = Path(__file__).resolve().parents[1] / "docs" / "data"
 PAGE, COVERAGE = DATA / "calibrated_intervals.csv", DATA / "interval_coverage.csv"
 SEED = 7001
 """Of the first scene; no other script draws scenes of these numbers."""
-VIEWS, WAYS, TIMES, TIMES_OF_MISTAKES = (3, 4, 6, 8, 12), ("tikhonov-tv", "holographic-tv"), 4, 2
+VIEWS, WAYS, TIMES, TIMES_OF_MISTAKES = (3, 4, 6, 8), ("tikhonov-tv", "holographic-tv"), 3, 2
 LEVEL, RIGHT = 0.90, 0.95
 """Parts of the scenes whose truth lies in an interval, and of the right runs that are not called wrong."""
 NUMBERS = (*SIGNED, *SIZES, "resolution")

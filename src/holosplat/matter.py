@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, Literal, NamedTuple, Self, cast
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
 
@@ -255,25 +254,8 @@ class MaterialPrior:
         """The bound of an occupancy from below: 0, or none (-inf) where matter may lie on both sides of its medium."""
         return -math.inf if self.two_sided else 0.0
 
-    @staticmethod
-    def from_dict(values: Mapping[str, Any]) -> MaterialPrior:
-        """The knowledge that `as_dict` described, as config.json holds it; `InputError` for anything else."""
-        try:
-            first = DeltaBeta(float(values["delta"]), float(values["beta"]))
-            others = [DeltaBeta(float(delta), float(beta)) for delta, beta in values.get("others", ())]
-            sign, medium = cast(Sign, int(values.get("sign", 0))), str(values.get("medium", ""))
-            made: dict[str, Callable[[], MaterialPrior]] = {
-                "known": lambda: MaterialPrior.known(first, *others, medium=medium),
-                "ratio": lambda: MaterialPrior.of_ratio(float(values["ratio"]), sign),
-                "free": lambda: MaterialPrior.unknown(sign),
-            }
-            found = made[values["kind"]]()
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
-            raise InputError(f"prior must be what reconstruct wrote, but it lacks or garbles {error}.") from error
-        return found.on_both_sides() if values.get("two_sided") else found
-
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, ready for JSON, as config.json holds them; `from_dict` reads them."""
+        """Plain values, ready for JSON, as config.json holds them."""
         first = self.materials[0] if self.materials else DeltaBeta(0.0, 0.0)
         told = {"sign": 0 if self.materials else self.sign, "medium": self.medium, "two_sided": self.two_sided}
         plain = {"kind": self.kind, "delta": first.delta, "beta": first.beta, "ratio": 0.0}

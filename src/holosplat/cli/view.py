@@ -213,10 +213,10 @@ def rehearse(run: Positional[Path], times: Many = 8, bins: Many | None = None, r
         times: Rehearsals, 2 or more.
         bins: Pixels joined along an edge, for speed (default: to about 48 pixels along the shorter side).
     """
-    from ..matter import MaterialPrior
     from ..methods.presets import method_of
     from ..methods.solve import Settled
     from ..report.run import report_run
+    from ..series.plan import prior_of
     from ..workflows.evaluate import evaluate as score
     from ..workflows.rehearsal import rehearse as repeat
     from ..workflows.run_folder import RunFolder, claimed
@@ -228,7 +228,7 @@ def rehearse(run: Positional[Path], times: Many = 8, bins: Many | None = None, r
     config = folder.read_config()
     with as_written(folder.config, "what reconstruct wrote"):
         method = Settled.again(method_of(dict(config["method"]), "method"), config["decided"]).method
-        prior, seed = MaterialPrior.from_dict(config["prior"]), int(config["seed"])
+        prior, seed = prior_of(config["prior"]), int(config["seed"])
     with claimed(folder):
         with ProgressBar() as bar:
             how = {"times": times, "bins": bins, "seed": seed, "folder": folder, "on_progress": bar.show}

@@ -306,9 +306,9 @@ def rehearse(
         >>> cells = hs.specimens.random_cells(1, box=(16e-6, 16e-6, 16e-6), seed=1)
         >>> scene = hs.MeshScene.of_one_material(cells, water)
         >>> scan = hs.simulate(scene, hs.Exposures.of(views, energy_kev=20.0, distance=0.05))
-        >>> prior, method = hs.MaterialPrior.known(water), hs.METHODS["holographic-tv"]
+        >>> prior, method = hs.MaterialPrior.known(water), hs.methods.METHODS["holographic-tv"]
         >>> run = hs.reconstruct(scan, prior, method)
-        >>> shown = rehearse(run, scan, prior, method, times=2)
+        >>> shown = hs.workflows.rehearse(run, scan, prior, method, times=2)
         >>> shown.word, len(shown.runs)
         ('consistent', 2)
     """
