@@ -49,7 +49,7 @@ DATA = Path(__file__).resolve().parents[1] / "docs" / "data"
 PAGE, COVERAGE = DATA / "calibrated_intervals.csv", DATA / "interval_coverage.csv"
 SEED = 7001
 """Of the first scene; no other script draws scenes of these numbers."""
-VIEWS, WAYS, TIMES, TIMES_OF_MISTAKES = (3, 4, 6, 8), ("tikhonov-tv", "holographic-tv"), 3, 2
+VIEWS, WAYS, TIMES, TIMES_OF_MISTAKES = (3, 4, 6, 8), ("ctf-tv", "holographic-tv"), 3, 2
 LEVEL, RIGHT = 0.90, 0.95
 """Parts of the scenes whose truth lies in an interval, and of the right runs that are not called wrong."""
 NUMBERS = (*SIGNED, *SIZES, "resolution")
@@ -163,11 +163,8 @@ def summary() -> None:
             error, centre, scale = columns_of(own, name)
             inside[family] = (np.abs(error - centre) <= own_factor * (scale + own_floor)).tolist()
         every = [one for each in inside.values() for one in each]
-        lines.append({"quantity": name, "family": "all", "scenes": str(len(every)), "covered": str(sum(every))})
-        lines += [
-            {"quantity": name, "family": family, "scenes": str(len(each)), "covered": str(sum(each))}
-            for family, each in inside.items()
-        ]
+        for family, each in {"all": every, **inside}.items():
+            lines.append(_line(name, family, len(each), sum(each), factor))
         print(f"{name}: factor {factor:.2f}, floor {floor:.3g}, {sum(every)} of {len(every)} covered", flush=True)
     parts.append(f"[{RESIDUAL}]\nfloor = 0.0\nfactor = {limit:.4g}\nscenes = {len(right)}\n")
     for mistake in ("", *MISTAKES):
@@ -178,12 +175,20 @@ def summary() -> None:
             print(
                 f"{mistake or 'right'}: {over} of {len(some)} above the limit {limit:.3g}; {unexplained} not explained"
             )
-            lines.append(
-                {"quantity": RESIDUAL, "family": mistake or "right", "scenes": str(len(some)), "covered": str(over)}
-            )
+            lines.append(_line(RESIDUAL, mistake or "right", len(some), over, limit))
     print(f"{len(right)} right runs of {len(families)} families, {len(wrong)} with a mistake")
     FACTORS.write_text("\n".join(parts))
     write(lines, COVERAGE)
+
+
+def _line(quantity: str, family: str, scenes: int, covered: int, factor: float) -> dict[str, str]:
+    return {
+        "quantity": quantity,
+        "family": family,
+        "scenes": str(scenes),
+        "covered": str(covered),
+        "factor": f"{factor:.3g}",
+    }
 
 
 def main() -> None:
