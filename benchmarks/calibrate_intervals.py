@@ -6,7 +6,7 @@
 Scenes are those of `family_scenes`, in turn of every simulated family, on pixels joined 2 × 2 (23 to 30 of them along
 an edge), of 3 to 8 views, reconstructed by linear retrieval or by retrieval of all views with total variation. A run's
 errors against the truth stand beside what its rehearsals say of them. Every second scene is also run with a mistake in
-what is said of it: then only the residual over that of the rehearsals counts.
+the metadata: then only the residual over that of the rehearsals counts.
 
 Factors are those of all scenes; the coverage of a family is that by factors of all other families. Frames are simulated
 with rays through meshes, or closed forms, on a raster several times finer than that of any fit.

@@ -1,5 +1,5 @@
-"""What to try next where frames are not explained: a sentence and a command for each likely cause; and mistakes in what
-is said of a scan, compared on held-out frames."""
+"""What to try next where frames are not explained: a sentence and a command for each likely cause; and mistakes in
+the metadata of a scan, compared on held-out frames."""
 
 from __future__ import annotations
 
@@ -66,13 +66,13 @@ def next_step(cause: str, scan: str = "SCAN") -> Step | None:
     return replace(step, command=" ".join(filter(None, ("holosplat", act, scan, step.command, "--out", out))))
 
 
-NULL = "as it is said"
+NULL = "metadata as given"
 """The candidate that leaves scan and prior alone."""
-NAME, BY = "mistake in what is said of the scan", "held-out frames"
+NAME, BY = "mistake in the metadata", "held-out frames"
 FEWEST = 4
 """Frames of which one can be held out."""
 RANGE = 3.0
-"""How many times larger or smaller than it is said a distance or δ/β may be."""
+"""Factor by which a distance or δ/β may be larger or smaller than given."""
 
 Change = Callable[[Scan, "Again"], tuple[Scan, Mapping[str, Any]]]
 """A scan and what is changed of its reconstruction, as `Again` takes it by name, if a mistake is put right."""
@@ -91,7 +91,7 @@ def _axis(scan: Scan, again: Again) -> tuple[Scan, Mapping[str, Any]]:
 
 
 def _turned(angles: Callable[[np.ndarray], np.ndarray]) -> Change:
-    """Other angles than those [rad] that the scan says."""
+    """Other angles [rad] than those of the scan."""
 
     def change(scan: Scan, again: Again) -> tuple[Scan, Mapping[str, Any]]:
         views = scan.views
@@ -116,7 +116,7 @@ def _ratio(scan: Scan, again: Again) -> tuple[Scan, Mapping[str, Any]]:
     prior = again.prior
     ratio = prior.materials[0].ratio if prior.materials else getattr(prior, "ratio", 0.0)
     if not ratio or len(prior.materials) > 1:
-        raise InputError("there is no one ratio δ/β that is told.")
+        raise InputError("there is no one known ratio δ/β.")
     return scan, {"prior": MaterialPrior.unknown(prior.sign), "uncertain": Uncertain(delta_beta=_about(abs(ratio)))}
 
 
@@ -151,7 +151,7 @@ MISTAKES: Mapping[str, tuple[str, Change]] = {
 
 
 def compare_causes(scan: Scan, again: Again, on_progress: Progress = lambda stage, fraction: None) -> Decision:
-    """Which of `MISTAKES`, put right, predicts held-out frames better than what is said of the scan, the null.
+    """Which of `MISTAKES`, put right, predicts held-out frames better than the metadata as given, the null.
 
     Without held-out frames, every fourth one is held out. Another sense of rotation is none of the mistakes: the
     mirrored object gives the same frames. The choice is a key of `STEPS`, or the null.

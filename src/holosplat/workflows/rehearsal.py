@@ -131,8 +131,8 @@ class Rehearsal:
     binned: pixels of the frames along an edge of one in a rehearsal; pixel: that edge [m]
     explained: the verdict on the measured frames at these pixels, reconstructed likewise
     runs: [K] tables of `errors_of`, the `residual` [B] and the likely `cause` of each rehearsal
-    total: what the run states [m³], None for none; quantity: of which index
-    cause: between the scan as it is said to be, the null, and mistakes; None where the residual gave no reason
+    total: that the run states [m³], None for none; quantity: of which index
+    cause: between the metadata as given, the null, and mistakes in them; None where the residual gave no reason
     """
 
     binned: int
@@ -383,6 +383,8 @@ def _frames(done: Reconstruction, coarse: Scan) -> tuple[np.ndarray, NoiseModel,
 
 def read_rehearsal(folder: RunFolder) -> Rehearsal | None:
     """The rehearsals in the summary.json of a run; None where none was made."""
+    if not folder.summary.is_file():
+        return None
     with as_written(folder.summary, "what rehearse wrote"):
         table = folder.read_summary().get(ENTRY)
         return None if table is None else Rehearsal.from_dict(table)
