@@ -14,6 +14,7 @@ from holosplat.inference import Decision
 from holosplat.matter import DeltaBeta, MaterialPrior, Matter
 from holosplat.methods import METHODS
 from holosplat.optics import NoiseModel
+from holosplat.optics.background import LightOptions
 from holosplat.representations import VoxelGrid
 from holosplat.workflows import Reconstruction, RunFolder, next_step, rehearsal
 from holosplat.workflows.next_step import MISTAKES, NULL, STEPS, compare_causes
@@ -211,3 +212,25 @@ def test_mistakes_are_found_on_held_out_frames_and_none_where_there_is_none(monk
     other = MaterialPrior.known(DeltaBeta(-WATER.delta, -WATER.beta))
     assert compare_causes(scan, replace(again, prior=other)).choice == "sign"
     assert compare_causes(scan[np.arange(3)], again).choice == NULL
+
+
+@pytest.mark.parametrize("wrong", ["", "half the angles", "other sign of δ"])
+def test_the_verdict_separates_right_and_wrong_scans(wrong, monkeypatch):
+    """By the shipped factors; the cause is compared by one mistake, beside the right one."""
+    few = ("other sign of δ", "twice the angles")
+    scan, prior, method = scan_of(12, 50000.0), PRIOR, METHODS["holographic-tv"]
+    if wrong:
+        scan, how = MISTAKES[wrong][1](scan, Again(prior, method, 0, None))
+        prior = how.get("prior", prior)
+    monkeypatch.setattr(next_step, "MISTAKES", {name: MISTAKES[name] for name in few})
+    shown = rehearse(hs.reconstruct(scan, prior, method), scan, prior, method, times=2)
+    print(shown.excess, shown.word, *shown.lines(), sep="\n")
+    assert (shown.word == "wrong") == bool(wrong)
+    if wrong:
+        assert shown.cause is not None
+        assert shown.cause.choice == {"half the angles": "angles", "other sign of δ": "sign"}[wrong]
+
+
+def test_smooth_light_without_air_is_refused():
+    with pytest.raises(hs.InputError, match="shows no air"):
+        hs.reconstruct(scan_of(12), PRIOR, METHODS["paganin-tv"], light=LightOptions("smooth"))

@@ -56,7 +56,7 @@ def headline(content: ReportContent) -> Headline:
     words = in_print(found.words.replace("The frames", f"The {named}"))
     text, _, rest = re.sub("[:;] ", "\n", words, count=1).partition("\n")
     text, details = text.rstrip("."), tuple(filter(None, (rest[:1].upper() + rest[1:],)))
-    if content.rehearsal is not None:
+    if content.rehearsal is not None and found is content.explained:
         return _rehearsed(content.rehearsal, (*details, scores), content.scan)
     if found.good:
         return Headline(text, True, (*details, scores, NOT_REHEARSED))

@@ -192,7 +192,7 @@ class Rehearsal:
 
     @property
     def limit(self) -> float:
-        """The excess that one right run in twenty passes, by the calibration."""
+        """The excess that 95 % of the right runs of the calibration stay below."""
         return factors()[RESIDUAL].factor
 
     @property
@@ -215,8 +215,8 @@ class Rehearsal:
         (over, band), found = self.excess, self.explained
         low, high = 1e6 * found.periods[band]
         at = f"at periods above {low:.3g} µm" if math.isinf(high) else f"at periods of {low:.3g} to {high:.3g} µm"
-        number = f"the residual {at} is {two_digits(over)} times what they leave or noise and model allow, which one "
-        number += f"right run in twenty exceeds from {two_digits(self.limit)} on"
+        number = f"the residual {at} is {two_digits(over)} times what they leave or noise and model allow; 95 % of "
+        number += f"{factors()[RESIDUAL].scenes} right runs on simulated scenes stay below {two_digits(self.limit)}"
         why = {
             "consistent": "the frames are explained",
             "limited": "this method leaves as much of simulated frames of its own result; more views, or another "
@@ -342,7 +342,7 @@ def rehearse(
             RESIDUAL: residual_by_band(found.verdict).tolist(),
             "cause": found.verdict.cause,
         }
-        kept = replace(kept, runs=(*kept.runs, run), cause=None)
+        kept = replace(kept, runs=(*kept.runs, run))
         _keep(folder, kept)
     if causes and kept.cause is None and kept.doubtful:
         kept = replace(kept, cause=compare_causes(coarse, again, on_progress))
@@ -363,7 +363,7 @@ class Again:
     def __call__(self, scan: Scan, further: int = 0, **changed: Any) -> Reconstruction:
         """The reconstruction of the training frames of `scan`, with another seed and what is `changed` of it."""
         done = self.done
-        taken = " ".join(each.choice for each in done.choice.decisions if each.name == STAGE)
+        taken = next((each.choice for each in reversed(done.choice.decisions) if each.name == STAGE), "")
         light = replace(done.light, noise="correlated" if CORRELATED in taken else "white")
         light = light if done.still is None else LightOptions()  # which finds the fixed pattern, too
         how = {"prior": self.prior, "method": self.method, "light": light, "matter": done.choice.matter}
