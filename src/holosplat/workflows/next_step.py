@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -16,16 +16,13 @@ from ..checks import InputError
 from ..geometry import Views, rotation_y
 from ..inference import Decision, Score, select
 from ..matter import DeltaBeta, MaterialPrior
-from ..methods import Uncertain
+from ..methods import Method, Uncertain
 from ..methods.cross_validation import predicted_frames
 from ..optics.background import LightOptions
 from ..progress import Progress
 from ..scan import Scan, interleaved_split
 from ..tables import overridden
 from .run_illumination import light_of
-
-if TYPE_CHECKING:
-    from .rehearsal import Again
 
 STIFF = "stiff"
 """The cause where no change of the frames explains them: the model of the matter, or views that do not agree."""
@@ -74,7 +71,26 @@ FEWEST = 4
 RANGE = 3.0
 """Factor by which a distance or δ/β may be larger or smaller than given."""
 
-Change = Callable[[Scan, "Again"], tuple[Scan, Mapping[str, Any]]]
+
+class Again(Protocol):
+    """Reconstructs other frames as a run did (`rehearsal.Again`)."""
+
+    @property
+    def prior(self) -> MaterialPrior:
+        """That of the run."""
+        ...
+
+    @property
+    def method(self) -> Method:
+        """That of the run."""
+        ...
+
+    def __call__(self, scan: Scan, **changed: Any) -> Any:
+        """The `Reconstruction` of the training frames of `scan`, with `changed` arguments of `reconstruct`."""
+        ...
+
+
+Change = Callable[[Scan, Again], tuple[Scan, Mapping[str, Any]]]
 """A scan and what is changed of its reconstruction, as `Again` takes it by name, if a mistake is put right."""
 
 
