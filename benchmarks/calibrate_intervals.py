@@ -140,7 +140,12 @@ def factor_of(rows: Sequence[dict[str, Any]], name: str) -> tuple[float, float]:
     """The floor and the factor of a quantity."""
     error, centre, scale = columns_of(rows, name)
     floor = float(np.median(scale))
-    return floor, conformal_quantile(np.abs(error - centre) / (scale + floor), LEVEL)
+    return floor, _quantile(np.abs(error - centre) / (scale + floor), LEVEL)
+
+
+def _quantile(scores: np.ndarray, level: float) -> float:
+    """The conformal quantile, or the largest of so few scores that there is none: then the level is n/(n + 1)."""
+    return min(conformal_quantile(scores, level), float(scores.max()))
 
 
 def summary() -> None:
@@ -148,7 +153,7 @@ def summary() -> None:
     rows = [row for row in read(PAGE) if row["excess"]]
     right, wrong = [r for r in rows if not r["mistake"]], [r for r in rows if r["mistake"]]
     excess = np.array([float(row["excess"]) for row in right])
-    limit = min(conformal_quantile(excess, RIGHT), float(excess.max()))
+    limit = _quantile(excess, RIGHT)
     parts = [f"# {len(right)} right runs; made by benchmarks/calibrate_intervals.py --summary from {PAGE.name}\n"]
     lines = list[dict[str, str]]()
     families = sorted({row["family"] for row in right})

@@ -199,6 +199,7 @@ def test_every_mistake_has_a_command():
     assert {key for key, _ in MISTAKES.values()} <= STEPS.keys()
 
 
+@pytest.mark.slow
 def test_mistakes_are_found_on_held_out_frames_and_none_where_there_is_none(monkeypatch):
     scan, method = scan_of(12), METHODS["paganin-tv"]
     few = ("other sign of δ", "twice the angles", "matter beyond the field")
@@ -214,21 +215,20 @@ def test_mistakes_are_found_on_held_out_frames_and_none_where_there_is_none(monk
     assert compare_causes(scan[np.arange(3)], again).choice == NULL
 
 
-@pytest.mark.parametrize("wrong", ["", "half the angles", "other sign of δ"])
+@pytest.mark.slow
+@pytest.mark.parametrize("wrong", ["", "half the angles"])
 def test_the_verdict_separates_right_and_wrong_scans(wrong, monkeypatch):
     """By the shipped factors; the cause is compared by one mistake, beside the right one."""
     few = ("other sign of δ", "twice the angles")
-    scan, prior, method = scan_of(12, 50000.0), PRIOR, METHODS["holographic-tv"]
+    scan, method = scan_of(12, 50000.0), METHODS["holographic-tv"]
     if wrong:
-        scan, how = MISTAKES[wrong][1](scan, Again(prior, method, 0, None))
-        prior = how.get("prior", prior)
+        scan, _ = MISTAKES[wrong][1](scan, Again(PRIOR, method, 0, None))
     monkeypatch.setattr(next_step, "MISTAKES", {name: MISTAKES[name] for name in few})
-    shown = rehearse(hs.reconstruct(scan, prior, method), scan, prior, method, times=2)
-    print(shown.excess, shown.word, *shown.lines(), sep="\n")
+    shown = rehearse(hs.reconstruct(scan, PRIOR, method), scan, PRIOR, method, times=2)
     assert (shown.word == "wrong") == bool(wrong)
     if wrong:
         assert shown.cause is not None
-        assert shown.cause.choice == {"half the angles": "angles", "other sign of δ": "sign"}[wrong]
+        assert shown.cause.choice == "angles"
 
 
 def test_smooth_light_without_air_is_refused():

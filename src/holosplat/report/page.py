@@ -80,7 +80,7 @@ def _rehearsed(found: Rehearsal, more: tuple[str, ...], scan: str) -> Headline:
     """The verdict by rehearsals, with the number that decided."""
     cause = found.cause.choice if found.cause is not None and found.cause.choice != NULL else found.explained.cause
     reasons = () if found.word != "wrong" else tuple(in_print(each) for each in found.explained.reasons)
-    first = found.lines()[0]
+    first = found.said
     said = (in_print(first[0].upper() + first[1:]), *reasons, *more)
     trusted = {"consistent": True, "limited": None, "wrong": False}[found.word]
     return Headline(VERDICTS[found.word], trusted, said, next_step(cause, scan) if found.word == "wrong" else None)

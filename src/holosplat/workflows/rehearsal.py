@@ -212,6 +212,11 @@ class Rehearsal:
 
     def lines(self) -> list[str]:
         """The verdict and the intervals, as lines of text."""
+        return [self.said, *self._cause_lines(), *self.intervals()]
+
+    @property
+    def said(self) -> str:
+        """The verdict and the number that decided, in a line."""
         (over, band), found = self.excess, self.explained
         low, high = 1e6 * found.periods[band]
         at = f"at periods above {low:.3g} µm" if math.isinf(high) else f"at periods of {low:.3g} to {high:.3g} µm"
@@ -221,14 +226,10 @@ class Rehearsal:
             "consistent": "the frames are explained",
             "limited": "this method leaves as much of simulated frames of its own result; more views, or another "
             "method, may do better",
-            "wrong": "this method would explain the frames better if the scan and what is known were right",
+            "wrong": "this method would explain the frames better if metadata and material were right",
         }[self.word]
-        return [
-            f"verdict by {len(self.runs)} rehearsals on pixels of {1e6 * self.pixel:.3g} µm: {self.word}: {why} "
-            f"({number})",
-            *self._cause_lines(),
-            *self.intervals(),
-        ]
+        many, pixel = len(self.runs), 1e6 * self.pixel
+        return f"verdict by {many} rehearsals on pixels of {pixel:.3g} µm: {self.word}: {why} ({number})"
 
     def _cause_lines(self) -> list[str]:
         if self.cause is None:
