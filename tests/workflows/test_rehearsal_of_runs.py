@@ -28,6 +28,7 @@ from holosplat.workflows.rehearsal import (
     read_rehearsal,
     rehearse,
 )
+from holosplat.workflows.verdict import Verdict
 
 WATER = hs.materials.parse_material("water").delta_beta(20.0)
 PRIOR, PIXEL, SHAPE = hs.MaterialPrior.known(WATER), 1e-6, (20, 23)
@@ -136,10 +137,9 @@ def test_larger_pixels_are_rehearsed_on_measured_frames_of_such_pixels(few, monk
 
 def made(own: float, left: float, allowed: float, good: bool, cause: Decision | None = None) -> Rehearsal:
     """A run whose only band has a residual `own`, and rehearsals that leave `left`."""
-    verdict = hs.workflows.verdict.Verdict
     powers = {name: np.full((2, 1), value) for name, value in (("residual", own), ("allowed", allowed))}
     powers |= {name: np.ones((2, 1)) for name in ("noise", "contrast")}
-    said = verdict(good, "words", (), np.array([[2e-6, np.inf]]), **powers, tested={}, cause="" if good else "mass")
+    said = Verdict(good, "words", (), np.array([[2e-6, np.inf]]), **powers, tested={}, cause="" if good else "mass")
     runs = [{"residual": [left], "cause": ""}, {"residual": [left], "cause": "mass"}]
     return Rehearsal(1, PIXEL, said, tuple(runs), cause=cause)
 
@@ -155,7 +155,7 @@ def test_the_three_words(monkeypatch):
     assert made(3.0, 2.5, 1.0, False, Decision("", NULL, "")).word == "limited"
     assert not made(3.0, 2.5, 1.0, False).doubtful
     alone = made(3.0, 2.5, 1.0, False)
-    assert replace(alone, runs=tuple(run | {"cause": ""} for run in alone.runs)).doubtful
+    assert replace(alone, runs=tuple({**run, "cause": ""} for run in alone.runs)).doubtful
 
 
 def test_rehearsals_are_kept_and_only_those_that_are_missing_are_made(tmp_path, monkeypatch):
@@ -217,13 +217,13 @@ def test_mistakes_are_found_on_held_out_frames_and_none_where_there_is_none(monk
 
 @pytest.mark.slow
 @pytest.mark.parametrize("wrong", ["", "half the angles"])
-def test_the_verdict_separates_right_and_wrong_scans(wrong, monkeypatch):
+def test_the_verdict_separates_right_and_wrong_scans(wrong, few, monkeypatch):
     """By the shipped factors; the cause is compared by one mistake, beside the right one."""
-    few = ("other sign of δ", "twice the angles")
+    tried = ("other sign of δ", "twice the angles")
     scan, method = scan_of(12, 50000.0), METHODS["holographic-tv"]
     if wrong:
-        scan, _ = MISTAKES[wrong][1](scan, Again(PRIOR, method, 0, None))
-    monkeypatch.setattr(next_step, "MISTAKES", {name: MISTAKES[name] for name in few})
+        scan, _ = MISTAKES[wrong][1](scan, Again(PRIOR, method, 0, few[0]))
+    monkeypatch.setattr(next_step, "MISTAKES", {name: MISTAKES[name] for name in tried})
     shown = rehearse(hs.reconstruct(scan, PRIOR, method), scan, PRIOR, method, times=2)
     assert (shown.word == "wrong") == bool(wrong)
     if wrong:
