@@ -44,6 +44,8 @@ FEWEST = 2
 """Rehearsals that have a spread."""
 FACTORS = Path(__file__).with_name("conformal.toml")
 """Factors of stated errors, with the scenes that they are of: benchmarks/calibrate_intervals.py."""
+LEVEL = 0.9
+"""Part of the calibration's scenes whose truth lies in an interval."""
 ENTRY = "rehearsal"
 """The entry of summary.json."""
 Word = Literal["consistent", "limited", "wrong"]
@@ -51,7 +53,7 @@ Word = Literal["consistent", "limited", "wrong"]
 
 @dataclass(frozen=True)
 class Factor:
-    """How a quantity of rehearsals becomes an interval that holds the truth in `level` of the calibration's scenes.
+    """How a quantity of rehearsals becomes an interval that holds the truth in `LEVEL` of the calibration's scenes.
 
     floor: median of the quantity's scale over the scenes, added to that of a run: a scale near 0 promises too much
     (Papadopoulos et al. 2008, normalised nonconformity); factor: of the sum of both
@@ -175,7 +177,7 @@ class Rehearsal:
         return np.array([run[name] for run in self.runs], dtype=np.float64)
 
     def interval(self, name: str) -> tuple[float, float]:
-        """Ends of the interval of 90 % of a quantity's error; that of a size begins at 0."""
+        """Ends of the interval of a quantity's error; that of a size begins at 0."""
         centre, scale = centre_and_scale(name, self.values(name))
         of = factors()[name]
         reach = of.factor * (scale + of.floor)
@@ -243,7 +245,8 @@ class Rehearsal:
         """What the intervals are of, and a line for each quantity."""
         ends = {name: self.interval(name) for name in (*SIGNED, *SIZES, "resolution")}
         scenes = min(each.scenes for each in factors().values())
-        lines = [f"intervals of 90 %, by {len(self.runs)} rehearsals and {scenes} simulated scenes:"]
+        level = min(LEVEL, scenes / (scenes + 1))  # the largest of few scores stands for their quantile
+        lines = [f"intervals of {level:.0%}, by {len(self.runs)} rehearsals and {scenes} simulated scenes:"]
         if self.total is not None:
             low, high = (self.total / (1 + end) if end > -1 else math.inf for end in reversed(ends["total"]))
             said = f"{low:.3g} to {high:.3g} m³ {self._told('total')}"
