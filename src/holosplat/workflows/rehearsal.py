@@ -84,9 +84,12 @@ RESIDUAL = "residual"
 
 
 def centre_and_scale(name: str, values: np.ndarray) -> tuple[float, float]:
-    """Where a quantity's error is expected by its values in rehearsals [K], and how far off that may be."""
+    """Where a quantity's error is expected by its values in rehearsals [K], and how far off that may be.
+
+    Resolutions at the limit of the sampling have no spread, so that all runs have the same scale.
+    """
     if name == "resolution":
-        return float(values.mean()), float(values.std(ddof=1))
+        return float(values.mean()), 1.0
     return 0.0, float(np.sqrt(np.square(values).mean()))
 
 
