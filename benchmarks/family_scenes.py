@@ -50,12 +50,14 @@ Judge = Callable[[hs.workflows.Reconstruction], float]
 
 @dataclass(frozen=True)
 class Scene:
-    """scan: frames, with those that no run sees; prior: what is told; error: of what a run made; facts: the draw."""
+    """scan: frames, with those that no run sees; prior: what is told; error: of what a run made; facts: the draw;
+    matter: of a simulated scene."""
 
     scan: Scan
     prior: hs.MaterialPrior
     error: Judge
     facts: str
+    matter: MeshScene | ContinuousScene | None = None
 
 
 @dataclass(frozen=True)
@@ -109,6 +111,7 @@ class Family:
             prior,
             lambda done: volume_scores(done.object.voxelise(grid), true).relative_error_delta,
             facts,
+            truth,
         )
 
     def _placed(self, rng: Draw, room: Room) -> Matter:

@@ -417,3 +417,28 @@ def few_photons() -> str:
     lines.sort(key=lambda line: (line[0], -float(line[1]), line[2]))
     head = ("case", "photons", "seed", "noise / contrast", "Dice, error of δ", "called explained", "seconds of a core")
     return markdown(head, lines)
+
+
+CALIBRATED = "python benchmarks/calibrate_intervals.py, and again with --summary"
+
+
+@table("intervals", CALIBRATED, "a night", "interval_coverage.csv")
+def intervals() -> str:
+    """Coverage of intervals by factors of other families."""
+    rows = [row for row in read("interval_coverage.csv") if row["quantity"] != "residual"]
+    lines = []
+    for name in dict.fromkeys(row["quantity"] for row in rows):
+        own = [row for row in rows if row["quantity"] == name]
+        every, parts = own[0], [int(row["covered"]) / int(row["scenes"]) for row in own[1:]]
+        lines.append([name, every["factor"], every["scenes"], every["covered"], str(len(parts)), f"{min(parts):.2f}"])
+    return markdown(("error of", "factor", "scenes", "covered", "families", "least coverage of a family"), lines)
+
+
+@table("mistakes", CALIBRATED, "a night", "interval_coverage.csv")
+def mistakes() -> str:
+    """Runs whose residual passes the limit of the verdict."""
+    rows = [row for row in read("interval_coverage.csv") if row["quantity"] == "residual"]
+    return markdown(
+        ("scan", "runs", "above the limit", "the limit"),
+        [[row["family"], row["scenes"], row["covered"], row["factor"]] for row in rows],
+    )

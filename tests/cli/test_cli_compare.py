@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from helpers.cli import COLUMNS, PIXEL, ROWS, Workshop, holosplat, refused, worked
-from holosplat.cli.compare import _side
+from holosplat.cli.view import _side
 from holosplat.metrics import fourier_shell_correlation
 from holosplat.report.compare import Comparison, differing, in_columns
 from holosplat.report.page import Table

@@ -327,5 +327,5 @@ def test_every_command_has_a_log_and_those_that_write_have_force():
     acts = {name: entry.command(name) for name in entry.COMMANDS if name not in ("bench", "series", "data")}
     for name, function in acts.items():
         options = inspect.signature(function).parameters
-        writes = name not in ("backends", "check", "doctor", "evaluate", "init", "materials", "run", "view")
+        writes = name not in ("backends", "check", "doctor", "evaluate", "init", "materials", "rehearse", "run", "view")
         assert ("log" in options, "force" in options) == (True, writes), name

@@ -8,6 +8,7 @@ import numpy as np
 from helpers.browser import needs_chromium, opened
 from helpers.report_page import PITCH, Page, content, scene
 from holosplat.geometry import Views
+from holosplat.inference import Decision
 from holosplat.metrics import robust_material_delta, volume_scores
 from holosplat.report import (
     render_page,
@@ -15,11 +16,12 @@ from holosplat.report import (
 )
 from holosplat.report.blocks import _ends
 from holosplat.report.content import flatten
-from holosplat.report.page import duration, headline, percent
+from holosplat.report.page import NOT_REHEARSED, VERDICTS, duration, headline, percent
 from holosplat.report.style import format_length, in_print, scientific
 from holosplat.report.surface import camera
 from holosplat.units import wavelength
 from holosplat.volume import Volume
+from holosplat.workflows.rehearsal import Rehearsal
 from holosplat.workflows.verdict import Verdict
 
 # --- the figures over the report ---
@@ -65,6 +67,23 @@ def test_a_good_verdict_is_the_headline_unless_held_out_frames_are_not_explained
     shown = headline(content(explained=good, held_out=held_out))
     assert shown.text == "Do not trust this volume: the held-out frames are not explained"
     assert headline(content()).trusted is None
+
+
+def test_rehearsals_give_the_headline_one_of_three_words():
+    unexplained = judged(False, "mass", words="The frames are not explained: the residual is 3 times the noise.")
+    run = {"residual": [1.0], "cause": "mass"}
+    limited = Rehearsal(1, 1e-6, unexplained, (run, run))
+    shown = headline(content(explained=unexplained, rehearsal=limited))
+    assert (shown.text, shown.trusted, shown.step) == (VERDICTS["limited"], None, None)
+    assert "limited" in shown.words[0]
+    wrong = replace(limited, cause=Decision("", "angles", "held-out frames"))
+    shown = headline(content(explained=unexplained, rehearsal=wrong))
+    assert (shown.text, shown.trusted) == (VERDICTS["wrong"], False)
+    assert shown.step is not None
+    assert "--angles FILE" in shown.step.command
+    good = judged(True, words="The frames are explained to within their noise: the residual is 1 of it.")
+    assert headline(content(explained=good, rehearsal=replace(limited, explained=good))).text == VERDICTS["consistent"]
+    assert NOT_REHEARSED in headline(content(explained=good)).words
 
 
 # --- absorption alone ---

@@ -259,6 +259,7 @@ def _print_result(folder: RunFolder, result: Reconstruction, report: Path) -> No
     put(result.verdict.lines("training frames") if result.verdict else ())
     if result.total:
         print(result.total.words)
+    say(f"not rehearsed: for intervals of these numbers, and a verdict beside them: holosplat rehearse {folder.path}")
 
 
 def render(

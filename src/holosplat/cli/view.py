@@ -1,4 +1,4 @@
-"""`holosplat view`, and the live view of `reconstruct --view`."""
+"""`holosplat view`, the live view of `reconstruct --view`, and `compare` and `rehearse`, which take finished runs."""
 
 from __future__ import annotations
 
@@ -13,11 +13,15 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional
 
-from ..checks import require
+from ..checks import as_written, require
+from ..io.reading import Reading, Told
 from ..progress import FitProgress, FitState
-from ..ranges import Within, ranged
+from ..ranges import Many, Within, ranged
+from .places import Output
+from .sentence import put, say
 
 if TYPE_CHECKING:
+    from ..report.compare import Side
     from ..representations import Stored
     from ..show.server import LiveView
     from ..workflows.run_folder import RunFolder
@@ -155,3 +159,80 @@ def _objects(what: Path) -> tuple[dict[str, Stored], list[str]]:
         return series, [f"{len(series)} objects"]
     obj = read_object(what)
     return at_times(obj, ()), [obj.described]
+
+
+def compare(
+    a: Positional[Path], b: Positional[Path], out: Output = Path("compare.html"), allow_external: bool = False
+) -> None:
+    """Compare two runs side by side: what was asked, decided and found, and where their volumes differ.
+
+    Of runs of matter in motion, the first times are compared.
+
+    Args:
+        a: Run folder.
+        b: Another one.
+        out: Page to write (HTML), with slices of both volumes and their difference.
+        allow_external: Follow links of the runs' scans to other files; only of files you trust.
+    """
+    from ..report.compare import Comparison, in_columns, write_comparison
+
+    for path in (a, b):
+        Told(allow_external=allow_external).vouch(path)
+    comparison = Comparison(_side(a), _side(b))
+    for table in (*comparison.found(), *comparison.asked()):
+        print("\n".join(in_columns(table)))
+    print(comparison.verdict())
+    write_comparison(comparison, out)
+    print(f"page: {out}")
+
+
+def _side(path: Path) -> Side:
+    """A run with its scores, as far as its scan is still there."""
+    from ..io.json import read_json
+    from ..io.reading import Part, Reading
+    from ..report.compare import side_of
+    from ..workflows.reconstruction import instants_of
+    from ..workflows.run_folder import RunFolder
+    from .scans import scan_for
+
+    folder, scan = RunFolder(path), None
+    folder.require_run()
+    told = read_json(folder.source).get("scan") if folder.source.is_file() else None
+    if told and Path(str(told)).exists():
+        scan = scan_for(folder, None, Reading(part=Part(time_frame=0)) if instants_of(folder) else Reading())
+    return side_of(folder, scan)
+
+
+def rehearse(run: Positional[Path], times: Many = 8, bins: Many | None = None, reading: Reading = Reading()) -> None:
+    """Say how sure the numbers of a run are: simulate its frames, reconstruct them likewise, and compare.
+
+    The intervals and the verdict join summary.json and the report. Rehearsals that are there are not made again.
+
+    Args:
+        run: Run folder.
+        times: Rehearsals, 2 or more.
+        bins: Pixels joined along an edge, for speed (default: to about 48 pixels along the shorter side).
+    """
+    from ..methods.presets import method_of
+    from ..methods.solve import Settled
+    from ..report.run import report_run
+    from ..series.plan import prior_of
+    from ..workflows.evaluate import evaluate as score
+    from ..workflows.rehearsal import rehearse as repeat
+    from ..workflows.run_folder import RunFolder, claimed
+    from .progress import ProgressBar
+    from .scans import run_and_scan
+
+    folder = RunFolder(run)
+    result, measured = run_and_scan(folder, None, reading)
+    config = folder.read_config()
+    with as_written(folder.config, "what reconstruct wrote"):
+        method = Settled.again(method_of(dict(config["method"]), "method"), config["decided"]).method
+        prior, seed = prior_of(config["prior"]), int(config["seed"])
+    with claimed(folder):
+        with ProgressBar() as bar:
+            how = {"times": times, "bins": bins, "seed": seed, "folder": folder, "on_progress": bar.show}
+            found = repeat(result, measured, prior, method, **how)
+        page = report_run(folder, result, measured, score(result, measured, None), None)
+    put(found.lines())
+    say(f"report: {page}")

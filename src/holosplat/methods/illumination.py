@@ -34,7 +34,8 @@ from .trials import UNEVEN, WITHOUT, Hypothesis, Trials, name_of, named, plain_l
 from .volume import SmoothVolume
 
 STAGE = "light and noise"
-HYPOTHESES = ("fixed pattern", FLUX, UNEVEN, "correlated noise")
+CORRELATED = "correlated noise"
+HYPOTHESES = ("fixed pattern", FLUX, UNEVEN, CORRELATED)
 """What may be added to the null, in this order where several predict alike."""
 
 Prepared = tuple[Hypothesis, tuple[Decision, ...]]

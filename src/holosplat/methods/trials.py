@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate, pad
 
-from ..checks import InputError
+from ..checks import InputError, require
 from ..inference import MARGIN, Score
 from ..optics.background import FLUX, ORDER, Background, Light, LightOptions
 from ..optics.noise_model import NoiseModel
@@ -145,6 +145,9 @@ class Trials:
     def _made(self, hypothesis: Hypothesis, fold: int) -> Trial:
         seen, unseen = self._first.folds.split(fold)
         light = self._light(hypothesis, fold)
+        require(
+            light is not None, "--light must be even or auto, but it is smooth, and a part of the frames shows no air."
+        )
         assert light is not None
         volume = self._first.volume(fold, light)
         return Trial(volume, light, seen, unseen, predictions(volume, unseen))

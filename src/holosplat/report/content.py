@@ -16,6 +16,7 @@ from ..metrics import ImageScores, VolumeScores, require_same_grid, robust_mater
 from ..representations import MovingSurfaces
 from ..units import in_percent, wavenumber
 from ..volume import Volume
+from ..workflows.rehearsal import Rehearsal
 from ..workflows.totals import TotalMatter
 from ..workflows.verdict import Verdict
 from .style import scientific
@@ -220,6 +221,7 @@ class ReportContent:
     - explained: the verdict on the training frames; None: not judged; scan: their name, as a command takes it
     - delta_told: whether δ is known from frames or prior; else β stands for δ in all volumes
     - total: the total δ by these frames; None: unknown
+    - rehearsal: what rehearsals of the run show; None: there were none
     - moving: bodies in motion, whose volumes are those of one time; None: matter stands still
     - view: the interactive 3D view; None: there is none
     - guess: that of a network before the fit; None: there was none
@@ -246,6 +248,7 @@ class ReportContent:
     explained: Verdict | None = None
     delta_told: bool = True
     total: TotalMatter | None = None
+    rehearsal: Rehearsal | None = None
     geometry: Geometry | None = None
     lit: LitViews | None = None
     moving: Moving | None = None

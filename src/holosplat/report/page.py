@@ -11,7 +11,8 @@ import numpy as np
 
 from ..io.atomic import atomic_path
 from ..units import XRAYS_KEV, beam_named, in_percent
-from ..workflows.next_step import Step, next_step
+from ..workflows.next_step import NULL, Step, next_step
+from ..workflows.rehearsal import Rehearsal
 from .blocks import make_blocks
 from .content import Moving, ReportContent, flatten
 from .style import format_length, in_print, scientific
@@ -55,11 +56,34 @@ def headline(content: ReportContent) -> Headline:
     words = in_print(found.words.replace("The frames", f"The {named}"))
     text, _, rest = re.sub("[:;] ", "\n", words, count=1).partition("\n")
     text, details = text.rstrip("."), tuple(filter(None, (rest[:1].upper() + rest[1:],)))
+    if content.rehearsal is not None and found is content.explained:
+        return _rehearsed(content.rehearsal, (*details, scores), content.scan)
     if found.good:
-        return Headline(text, True, (*details, scores))
+        return Headline(text, True, (*details, scores, NOT_REHEARSED))
     text = f"Do not trust this volume: {text[0].lower()}{text[1:]}"
-    reasons = tuple(in_print(reason) for reason in found.reasons)
+    reasons = (*(in_print(reason) for reason in found.reasons), NOT_REHEARSED)
     return Headline(text, False, (*details, *reasons, scores), next_step(found.cause, content.scan))
+
+
+NOT_REHEARSED = (
+    "No rehearsal was made: how much of the residual the method leaves anyway, and how far off the numbers may be, is "
+    "unknown (holosplat rehearse)."
+)
+VERDICTS = {
+    "consistent": "Consistent: the frames are explained",
+    "limited": "Limited: as good as this method gets with these views",
+    "wrong": "Do not trust this volume: the method would explain the frames better if scan and material were right",
+}
+
+
+def _rehearsed(found: Rehearsal, more: tuple[str, ...], scan: str) -> Headline:
+    """The verdict by rehearsals, with the number that decided."""
+    cause = found.cause.choice if found.cause is not None and found.cause.choice != NULL else found.explained.cause
+    reasons = () if found.word != "wrong" else tuple(in_print(each) for each in found.explained.reasons)
+    first = found.said
+    said = (in_print(first[0].upper() + first[1:]), *reasons, *more)
+    trusted = {"consistent": True, "limited": None, "wrong": False}[found.word]
+    return Headline(VERDICTS[found.word], trusted, said, next_step(cause, scan) if found.word == "wrong" else None)
 
 
 def verdict(content: ReportContent) -> str:
@@ -125,6 +149,7 @@ def score_tables(content: ReportContent) -> list[Table]:
     tables = (
         _bodies_table(content),
         _total_table(content),
+        _rehearsal_table(content),
         _volume_table(content),
         _views_table(content),
         _geometry_table(content),
@@ -201,6 +226,15 @@ def _total_table(content: ReportContent) -> Table | None:
         ("in words", in_print(total.words)),
     ]
     return Table("Total", rows)
+
+
+def _rehearsal_table(content: ReportContent) -> Table | None:
+    if content.rehearsal is None:
+        return None
+    first, *intervals = content.rehearsal.intervals()
+    return Table(
+        first[0].upper() + first[1:].rstrip(":"), [tuple(map(in_print, each.split(": ", 1))) for each in intervals]
+    )
 
 
 def _volume_table(content: ReportContent) -> Table | None:

@@ -29,6 +29,7 @@ from ..volume import Volume
 from ..workflows.evaluate import Evaluation, of_absorption, render
 from ..workflows.forecast import NUMBERS, flow_in_words, read_band
 from ..workflows.reconstruct import Reconstruction
+from ..workflows.rehearsal import read_rehearsal
 from ..workflows.run_folder import RunFolder
 from ..workflows.track import read_errors
 from .content import GuessShown, HeldOutViews, LitViews, Moving, ProjectedMaps, ReportContent, view_labels
@@ -109,6 +110,7 @@ def report_run(
         explained=reconstruction.verdict,
         delta_told=reconstruction.delta_told and not absorbs,
         total=reconstruction.total,
+        rehearsal=read_rehearsal(folder),
         geometry=reconstruction.geometry,
         lit=_lit(reconstruction, scan, evaluation),
         moving=moving,

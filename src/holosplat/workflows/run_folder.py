@@ -126,7 +126,9 @@ class RunFolder:
 
     def read_summary(self) -> dict[str, Any]:
         """What summary.json holds; `InputError` if it is of another run than config.json, or of other settings."""
-        summary = _with_tables(self.summary, ("timing_s", "detector", "material", "verdict", "total", "geometry"))
+        summary = _with_tables(
+            self.summary, ("timing_s", "detector", "material", "verdict", "total", "geometry", "rehearsal")
+        )
         require_bound(self.summary, summary, self._own(), self.config)
         return summary
 

@@ -1,0 +1,220 @@
+"""Conformal factors of the errors that `rehearse` states, on sealed scenes: docs/data/calibrated_intervals.csv.
+
+    python benchmarks/calibrate_intervals.py --scenes 200     # resumable; rows that are there are not made again
+    python benchmarks/calibrate_intervals.py --summary        # factors of the package, and coverage by family
+
+Scenes are those of `family_scenes`, in turn of every simulated family, on pixels joined 2 × 2 (23 to 30 of them along
+an edge), of 3 to 6 views, reconstructed by linear retrieval or by retrieval of all views with total variation. A run's
+errors against the truth stand beside what its rehearsals say of them. Every fourth scene is also run with a mistake in
+the metadata: then only the residual over that of the rehearsals counts.
+
+Factors are those of all scenes; the coverage of a family is that by factors of all other families. Frames are simulated
+with rays through meshes, or closed forms, on a raster several times finer than that of any fit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+import numpy as np
+from family_scenes import SIMULATED
+from machine import commit
+from rows import machine, merge, read, write
+
+import holosplat as hs
+from holosplat.geometry import rotation_y
+from holosplat.methods import METHODS
+from holosplat.scan import Scan
+from holosplat.workflows.rehearsal import (
+    FACTORS,
+    LEVEL,
+    RESIDUAL,
+    SIGNED,
+    SIZES,
+    Rehearsal,
+    centre_and_scale,
+    conformal_quantile,
+    errors_of,
+    rehearse,
+)
+
+DATA = Path(__file__).resolve().parents[1] / "docs" / "data"
+PAGE, COVERAGE = DATA / "calibrated_intervals.csv", DATA / "interval_coverage.csv"
+SEED = 7001
+"""Of the first scene; no other script draws scenes of these numbers."""
+VIEWS, WAYS, TIMES, TIMES_OF_MISTAKES = (3, 4, 6), ("ctf-tv", "holographic-tv"), 2, 2
+RIGHT = 0.95
+"""Part of the right runs that are not called wrong."""
+NUMBERS = (*SIGNED, *SIZES, "resolution")
+COLUMNS = ("scene", "family", "method", "views", "mistake", "good", "excess")
+COLUMNS += tuple(f"{name}_{what}" for name in NUMBERS for what in ("error", "centre", "scale"))
+COLUMNS += ("facts", "seconds", "machine", "commit")
+
+Mistake = Callable[[Scan, hs.MaterialPrior, np.random.Generator], tuple[Scan, hs.MaterialPrior]]
+
+
+def _posed(scan: Scan, rotations: np.ndarray, shifts: np.ndarray | None = None) -> Scan:
+    views = replace(scan.views, rotations=rotations, shifts=scan.views.shifts if shifts is None else shifts)
+    return replace(scan, exposures=replace(scan.exposures, views=views))
+
+
+def shuffled(scan: Scan, prior: hs.MaterialPrior, rng: np.random.Generator) -> tuple[Scan, hs.MaterialPrior]:
+    """Angles in another order."""
+    return _posed(scan, scan.views.rotations[rng.permutation(len(scan))]), prior
+
+
+def halved(scan: Scan, prior: hs.MaterialPrior, rng: np.random.Generator) -> tuple[Scan, hs.MaterialPrior]:
+    """Half the angles."""
+    angles = np.unwrap(np.arctan2(scan.views.rotations[:, 0, 2], scan.views.rotations[:, 0, 0]))
+    return _posed(scan, rotation_y(np.rad2deg(0.5 * angles))), prior
+
+
+def off_axis(scan: Scan, prior: hs.MaterialPrior, rng: np.random.Generator) -> tuple[Scan, hs.MaterialPrior]:
+    """An axis of rotation 2 to 4 pixels elsewhere."""
+    by = rng.choice([-1, 1]) * rng.uniform(2, 4) * scan.views.finest
+    return _posed(scan, scan.views.rotations, scan.views.shifts + np.array([by, 0.0])), prior
+
+
+def other_sign(scan: Scan, prior: hs.MaterialPrior, rng: np.random.Generator) -> tuple[Scan, hs.MaterialPrior]:
+    """Matter on the other side of its medium."""
+    flipped = [hs.DeltaBeta(-delta, -beta) for delta, beta in prior.materials]
+    return scan, hs.MaterialPrior.known(*flipped) if flipped else prior.signed(-1)
+
+
+MISTAKES: dict[str, Mistake] = {
+    "angles shuffled": shuffled,
+    "half the angles": halved,
+    "axis elsewhere": off_axis,
+    "other sign": other_sign,
+}
+
+
+def rows_of(number: int) -> Iterator[dict[str, Any]]:
+    """The rows of a scene."""
+    rng, began = np.random.default_rng([SEED, number]), time.perf_counter()
+    name = list(SIMULATED)[number % len(SIMULATED)]
+    views, way = int(rng.choice(VIEWS)), str(rng.choice(WAYS))
+    made = replace(SIMULATED[name], views=(views,)).scene(SEED + number, name)
+    scan = made.scan.binned(2)
+    assert made.matter is not None
+    truth = made.matter.voxelise(hs.Grid.of_views(scan.views))
+    shared = {"scene": number, "family": name, "method": way, "views": views, "facts": made.facts}
+    shared |= {"machine": machine(), "commit": commit()}
+    mistakes = ["", str(rng.choice(list(MISTAKES)))] if number % 4 == 3 else [""]
+    for mistake in mistakes:
+        told, prior = MISTAKES[mistake](scan, made.prior, rng) if mistake else (scan, made.prior)
+        try:
+            done = hs.reconstruct(told, prior, METHODS[way])
+            times = TIMES_OF_MISTAKES if mistake else TIMES
+            shown = rehearse(done, told, prior, METHODS[way], times=times, bins=1, causes=False)
+        except hs.InputError as refusal:
+            yield shared | {"mistake": mistake, "good": f"refused: {refusal}"}
+            continue
+        numbers = {} if mistake else _numbers(shown, errors_of(done, truth))
+        facts = {"mistake": mistake, "good": shown.explained.good, "excess": f"{shown.excess[0]:.4g}"}
+        yield shared | facts | numbers | {"seconds": f"{time.perf_counter() - began:.1f}"}
+
+
+def _numbers(shown: Rehearsal, errors: dict[str, float]) -> dict[str, str]:
+    found = dict[str, str]()
+    for name in NUMBERS:
+        centre, scale = centre_and_scale(name, shown.values(name))
+        for what, value in (("error", errors[name]), ("centre", centre), ("scale", scale)):
+            found[f"{name}_{what}"] = f"{value:.5g}"
+    return found
+
+
+def columns_of(rows: Sequence[dict[str, Any]], name: str) -> np.ndarray:
+    """Errors, expected errors and scales of a quantity, [3, N]."""
+    return np.array([[float(row[f"{name}_{what}"]) for row in rows] for what in ("error", "centre", "scale")])
+
+
+def factor_of(rows: Sequence[dict[str, Any]], name: str) -> tuple[float, float]:
+    """The floor and the factor of a quantity."""
+    error, centre, scale = columns_of(rows, name)
+    floor = float(np.median(scale))
+    return floor, _quantile(np.abs(error - centre) / (scale + floor), LEVEL)
+
+
+def _quantile(scores: np.ndarray, level: float) -> float:
+    """The conformal quantile, or the largest of so few scores that there is none: then the level is n/(n + 1)."""
+    return min(conformal_quantile(scores, level), float(scores.max()))
+
+
+def summary() -> None:
+    """Write the package's factors and the coverage by family, and print both."""
+    rows = [row for row in read(PAGE) if row["excess"]]
+    right, wrong = [r for r in rows if not r["mistake"]], [r for r in rows if r["mistake"]]
+    excess = np.array([float(row["excess"]) for row in right])
+    limit = _quantile(excess, RIGHT)
+    parts = [f"# {len(right)} right runs; made by benchmarks/calibrate_intervals.py --summary from {PAGE.name}\n"]
+    lines = list[dict[str, str]]()
+    families = sorted({row["family"] for row in right})
+    for name in NUMBERS:
+        floor, factor = factor_of(right, name)
+        parts.append(f"[{name}]\nfloor = {floor:.4g}\nfactor = {factor:.4g}\nscenes = {len(right)}\n")
+        inside = dict[str, list[bool]]()
+        for family in families:
+            others = [row for row in right if row["family"] != family]
+            own = [row for row in right if row["family"] == family]
+            own_floor, own_factor = factor_of(others, name)
+            error, centre, scale = columns_of(own, name)
+            inside[family] = (np.abs(error - centre) <= own_factor * (scale + own_floor)).tolist()
+        every = [one for each in inside.values() for one in each]
+        for family, each in {"all": every, **inside}.items():
+            lines.append(_line(name, family, len(each), sum(each), factor))
+        print(f"{name}: factor {factor:.2f}, floor {floor:.3g}, {sum(every)} of {len(every)} covered", flush=True)
+    parts.append(f"[{RESIDUAL}]\nfloor = 0.0\nfactor = {limit:.4g}\nscenes = {len(right)}\n")
+    for mistake in ("", *MISTAKES):
+        some = [row for row in rows if row["mistake"] == mistake]
+        over = sum(float(row["excess"]) > limit for row in some)
+        unexplained = sum(row["good"] == "False" for row in some)
+        if some:
+            print(
+                f"{mistake or 'right'}: {over} of {len(some)} above the limit {limit:.3g}; {unexplained} not explained"
+            )
+            lines.append(_line(RESIDUAL, mistake or "right", len(some), over, limit))
+    print(f"{len(right)} right runs of {len(families)} families, {len(wrong)} with a mistake")
+    FACTORS.write_text("\n".join(parts))
+    write(lines, COVERAGE)
+
+
+def _line(quantity: str, family: str, scenes: int, covered: int, factor: float) -> dict[str, str]:
+    return {
+        "quantity": quantity,
+        "family": family,
+        "scenes": str(scenes),
+        "covered": str(covered),
+        "factor": f"{factor:.3g}",
+    }
+
+
+def main() -> None:
+    """Make rows that are not there, or the summary of those that are."""
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
+    parser.add_argument("--scenes", type=int, default=200)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--summary", action="store_true")
+    options = parser.parse_args()
+    if options.summary:
+        summary()
+        return
+    for number in range(options.first, options.scenes):
+        if any(row["scene"] == str(number) for row in read(PAGE)):
+            continue
+        rows = list(rows_of(number))
+        merge(rows, PAGE, "scene", columns=COLUMNS)
+        for row in rows:
+            print({name: row.get(name, "") for name in COLUMNS[:10]}, row.get("seconds", ""), flush=True)
+
+
+if __name__ == "__main__":
+    main()

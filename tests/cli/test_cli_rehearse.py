@@ -1,0 +1,53 @@
+"""`holosplat rehearse`: intervals and verdict on the command line, in summary.json and in the report."""
+
+from __future__ import annotations
+
+import shutil
+
+import pytest
+
+import holosplat as hs
+from helpers.cli import holosplat, refused, worked
+from holosplat.io.json import read_json, write_json
+from holosplat.workflows import next_step
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A linear run of four small frames."""
+    folder = tmp_path_factory.mktemp("rehearsed")
+    water = hs.materials.parse_material("water").delta_beta(20.0)
+    scene = hs.MeshScene.of_one_material(hs.specimens.random_cells(1, (14e-6, 14e-6, 14e-6), 1, 9e-6), water)
+    views = hs.Views.evenly_spaced(4, (16, 17), 1e-6)
+    hs.write_scan(folder / "scan.nxs", hs.simulate(scene, hs.Exposures.of(views, 20.0, 0.03)))
+    out = folder / "run"
+    said = worked(
+        holosplat("reconstruct", folder / "scan.nxs", "--out", out, "--method", "ctf-tv", "--material", "water")
+    )
+    assert f"verdict beside them: holosplat rehearse {out}" in said.err
+    assert "No rehearsal was made" in (out / "report.html").read_text(encoding="utf-8")
+    return out
+
+
+def test_intervals_are_printed_and_kept(run, monkeypatch):
+    monkeypatch.setattr(next_step, "MISTAKES", {})
+    said = worked(holosplat("rehearse", run, "--times", 2))
+    assert "verdict by 2 rehearsals" in said.out
+    assert ", by 2 rehearsals and" in said.out
+    assert "Dice: at least" in said.out
+    table = read_json(run / "summary.json")["rehearsal"]
+    assert table["word"] in said.out
+    assert set(table["intervals_of_errors"]) == {"total", "delta", "volume", "centre", "dice", "error", "resolution"}
+    assert "Intervals of " in (run / "report.html").read_text(encoding="utf-8")
+    worked(holosplat("check", run))
+    again = worked(holosplat("rehearse", run, "--times", 2))
+    assert again.out == said.out
+
+
+def test_bad_input_is_refused(run, tmp_path):
+    refused(holosplat("rehearse", run, "--times", 1), "times must be 2 rehearsals or more", "1")
+    refused(holosplat("rehearse", tmp_path), "must hold a reconstruction")
+    broken = tmp_path / "broken"
+    shutil.copytree(run, broken)
+    write_json(broken / "config.json", read_json(broken / "config.json") | {"prior": {"kind": "none"}})
+    refused(holosplat("rehearse", broken, "--times", 2), "config.json")
