@@ -23,6 +23,7 @@ PIXEL_RANGE_M = (1e-10, 1e-2)
 DISTANCE_RANGE_M = (1e-9, 1e4)
 MOST_BLUR_PX = 1000.0
 """Blur beyond which a frame is one grey."""
+MOST_BANDWIDTH = 0.5
 """Limits of a distance [m] that is not zero; at 0, in contact, there is absorption alone."""
 
 
@@ -35,6 +36,7 @@ class Exposures:
     psf_sigma_px: [N] standard deviations of the Gaussian point-spread function [detector pixels].
     time: [N] seconds since the first frame.
     reference_kev: the energy [keV] for which δ and β of matter are given (None: the energy of the first frame).
+    bandwidth: [N] relative full widths at half maximum ΔE/E of a Gaussian spectrum about the energy; 0: one energy.
 
     A number stands for N equal ones. Errors: `InputError` for numbers out of range.
 
@@ -56,12 +58,13 @@ class Exposures:
     psf_sigma_px: np.ndarray
     time: np.ndarray
     reference_kev: float | None = None
+    bandwidth: np.ndarray = field(default_factory=lambda: np.zeros(()))
 
     def __post_init__(self) -> None:
         count = len(self.views)
         for size in np.unique(self.views.pixel_sizes):
             in_range("pixel size", float(size), *PIXEL_RANGE_M, unit="metres")
-        for name in ("energy_kev", "distance", "psf_sigma_px", "time"):
+        for name in ("energy_kev", "distance", "psf_sigma_px", "time", "bandwidth"):
             array = np.broadcast_to(np.asarray(getattr(self, name), dtype=np.float64), (count,))
             object.__setattr__(self, name, array.copy())
         for energy in (*self.energy_kev, *([] if self.reference_kev is None else [self.reference_kev])):
@@ -70,6 +73,13 @@ class Exposures:
             checked_distance(float(z))
         finite("psf_sigma_px", self.psf_sigma_px)
         finite("time", self.time)
+        finite("bandwidth", self.bandwidth)
+        for width in (self.bandwidth.min(initial=0.0), self.bandwidth.max(initial=0.0)):
+            require(
+                0 <= width <= MOST_BANDWIDTH,
+                f"bandwidth must lie between 0 and {MOST_BANDWIDTH:g}, as a share of the energy, but it is {width:g}; "
+                "correct it.",
+            )
         worst = float(self.psf_sigma_px.max(initial=0.0))
         require(bool(np.all(self.psf_sigma_px >= 0)), "psf_sigma_px must not be negative; correct it.")
         require(
@@ -94,6 +104,7 @@ class Exposures:
             psf_sigma_px=self.psf_sigma_px[index],
             time=self.time[index],
             reference_kev=self.reference_kev if self.has_one_energy else self.reference_energy,
+            bandwidth=self.bandwidth[index],
         )
 
     @property

@@ -11,6 +11,8 @@ import numpy as np
 
 from ..baselines.material import MaterialEstimate, estimate_ratio
 from ..checks import InputError, require
+from ..fit.residuals import set_aside
+from ..inference import select
 from ..matter import DeltaBeta, Known, KnownRatio, KnownSeveral, MaterialPrior
 from ..ranges import ranged
 from ..scan import Scan
@@ -43,8 +45,29 @@ ENOUGH_AIR = 0.1
 
 Range = tuple[float, float]
 
-UNITS = {"distance": " m", "energy_kev": " keV", "delta_beta": ""}
-CALLED = {"distance": "distance", "energy_kev": "energy", "delta_beta": "δ/β"}
+UNITS = {
+    "distance": " m",
+    "energy_kev": " keV",
+    "delta_beta": "",
+    "bandwidth": "",
+    "source_angle": " rad",
+    "psf_sigma_px": " pixels",
+}
+CALLED = {
+    "distance": "distance",
+    "energy_kev": "energy",
+    "delta_beta": "δ/β",
+    "bandwidth": "bandwidth",
+    "source_angle": "source size over its distance",
+    "psf_sigma_px": "blur of the detector",
+}
+WIDTHS = ("bandwidth", "source_angle", "psf_sigma_px")
+"""Constants that may be 0, which holds unless the frames predict each other better with the likeliest value."""
+NONE, SOME, BY = "none", "some", "frames set aside"
+FEWEST = 3
+"""Frames from which on one is predicted from the others."""
+UNSEEN = 4
+"""One frame in so many is predicted from the others in that comparison, one at least."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +81,12 @@ class Uncertain:
     """Photon energy [keV], the same for all frames."""
     delta_beta: Range | None = None
     """δ/β of the one material, at the nominal energy."""
+    bandwidth: Range | None = None
+    """Relative full width at half maximum of the spectrum, the same for all frames."""
+    source_angle: Range | None = None
+    """Standard deviation of the source over its distance from the sample [rad]."""
+    psf_sigma_px: Range | None = None
+    """Standard deviation of the detector's blur [pixels]."""
 
     def __post_init__(self) -> None:
         for name, (low, high) in self.given().items():
@@ -127,7 +156,32 @@ def determine(task: Task, uncertain: Uncertain, options: ProfileOptions | None =
     profile = Profile(task, ratio, middle | {"delta_beta": ratio}, corners, options or ProfileOptions())
     if profile.air() < ENOUGH_AIR:
         return _untold(ranges, middle, "too few pixels show empty space, without which frames cannot tell")
-    return Search(profile, ranges, task, start).run()
+    return without_idle(profile, Search(profile, ranges, task, start).run())
+
+
+def without_idle(profile: Profile, found: tuple[Determined, ...]) -> tuple[Determined, ...]:
+    """`found` with 0 for each width that the frames do not need, all others as they were found.
+
+    A width is kept where `inference.select` takes it: frames are predicted by a volume of the other ones.
+    """
+    frames = len(profile)
+    unseen = set_aside(frames, max(1, frames // UNSEEN))
+    for i, each in enumerate(found):
+        if each.name not in WIDTHS:
+            continue
+        values = {one.name: one.value for one in found}
+        held = {NONE: values | {each.name: 0.0}, SOME: values}
+        enough = each.told and frames >= FEWEST
+        choice = NONE
+        if enough:
+            scores = {name: profile.score(values, unseen) for name, values in held.items()}
+            chosen = select(CALLED[each.name], (NONE, SOME), lambda name, _, of=scores: of[name], by=BY)
+            choice = chosen.choice
+        if choice == NONE:
+            remark = f"{chosen.line}; 0 is used" if enough else "0 is used"
+            none = replace(each, value=0.0, low=0.0, told=False, remark=remark)
+            found = (*found[:i], none, *found[i + 1 :])
+    return found
 
 
 def likeliest_ratio(task: Task, options: ProfileOptions | None = None) -> Determined:
@@ -139,7 +193,10 @@ def likeliest_ratio(task: Task, options: ProfileOptions | None = None) -> Determ
 
 
 def _untold(ranges: Mapping[str, Range], middle: Mapping[str, float], why: str) -> tuple[Determined, ...]:
-    return tuple(Determined(name, middle[name], *_sorted(r), r, False, why) for name, r in ranges.items())
+    return tuple(
+        Determined(name, 0.0 if name in WIDTHS else middle[name], *_sorted(r), r, False, why)
+        for name, r in ranges.items()
+    )
 
 
 def told(task: Task, found: tuple[Determined, ...]) -> Task:
