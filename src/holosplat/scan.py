@@ -24,6 +24,7 @@ DISTANCE_RANGE_M = (1e-9, 1e4)
 MOST_BLUR_PX = 1000.0
 """Blur beyond which a frame is one grey."""
 MOST_BANDWIDTH = 0.5
+PER_FRAME = ("energy_kev", "distance", "psf_sigma_px", "time", "bandwidth")
 """Limits of a distance [m] that is not zero; at 0, in contact, there is absorption alone."""
 
 
@@ -64,7 +65,7 @@ class Exposures:
         count = len(self.views)
         for size in np.unique(self.views.pixel_sizes):
             in_range("pixel size", float(size), *PIXEL_RANGE_M, unit="metres")
-        for name in ("energy_kev", "distance", "psf_sigma_px", "time", "bandwidth"):
+        for name in PER_FRAME:
             array = np.broadcast_to(np.asarray(getattr(self, name), dtype=np.float64), (count,))
             object.__setattr__(self, name, array.copy())
         for energy in (*self.energy_kev, *([] if self.reference_kev is None else [self.reference_kev])):
@@ -74,12 +75,9 @@ class Exposures:
         finite("psf_sigma_px", self.psf_sigma_px)
         finite("time", self.time)
         finite("bandwidth", self.bandwidth)
-        for width in (self.bandwidth.min(initial=0.0), self.bandwidth.max(initial=0.0)):
-            require(
-                0 <= width <= MOST_BANDWIDTH,
-                f"bandwidth must lie between 0 and {MOST_BANDWIDTH:g}, as a share of the energy, but it is {width:g}; "
-                "correct it.",
-            )
+        for width in np.unique(self.bandwidth):
+            within = f"bandwidth must lie between 0 and {MOST_BANDWIDTH:g}, as a share of the energy"
+            require(0 <= width <= MOST_BANDWIDTH, f"{within}, but it is {width:g}; correct it.")
         worst = float(self.psf_sigma_px.max(initial=0.0))
         require(bool(np.all(self.psf_sigma_px >= 0)), "psf_sigma_px must not be negative; correct it.")
         require(
@@ -99,12 +97,8 @@ class Exposures:
         return replace(
             self,
             views=self.views[index],
-            energy_kev=self.energy_kev[index],
-            distance=self.distance[index],
-            psf_sigma_px=self.psf_sigma_px[index],
-            time=self.time[index],
             reference_kev=self.reference_kev if self.has_one_energy else self.reference_energy,
-            bandwidth=self.bandwidth[index],
+            **{name: getattr(self, name)[index] for name in PER_FRAME},
         )
 
     @property

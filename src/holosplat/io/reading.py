@@ -17,7 +17,6 @@ from ..units import photon_energy
 from .angles import read_angles, tell_angles, tell_views
 
 if TYPE_CHECKING:
-    from ..geometry import Views
     from ..scan import Scan
     from .beams import Beams
 
@@ -134,8 +133,7 @@ class Told:
 
     def found(self, constants: Mapping[str, float]) -> Told:
         """The same with what a reconstruction found for the ranges; a source's size is among its constants alone."""
-        said = {name: constants.get(name) for name in self.ranges()}
-        return replace(self, **said)
+        return replace(self, **{name: constants.get(name) for name in self.ranges()})
 
     def _from_source(self) -> float:
         if self.source_distance is None:
@@ -271,7 +269,11 @@ class Reading:
 
             scan = stitched(scan)
         tell_views(scan)
-        return self.part.of(scan if self.told.tube is None else Tube.parsed(self.told.tube).taken_out_of(scan))
+        if self.told.tube is not None:
+            from .half_acquisition import Tube
+
+            scan = Tube.parsed(self.told.tube).taken_out_of(scan)
+        return self.part.of(scan)
 
     def as_table(self) -> dict[str, Any]:
         """What differs from the default, by field, ready for JSON; paths are absolute. `time_frame` is not there."""
@@ -381,49 +383,3 @@ def _whole(option: str, word: str) -> int:
     if found is None or abs(found) > LARGEST:
         raise InputError(f"{option} must be made of whole numbers, as in 0:91:8 or 3,5, but it says {shown(word)}.")
     return found
-
-
-@dataclass(frozen=True)
-@ranged
-class Tube:
-    """A round tube about the rotation axis. inner, outer: diameters [m]; attenuation: µ of its wall [1/m]."""
-
-    inner: float
-    outer: float
-    attenuation: float
-
-    def __post_init__(self) -> None:
-        good = 0 <= self.inner < self.outer < math.inf and 0 < self.attenuation < math.inf
-        require(
-            good,
-            "a tube must have an inner diameter from 0, a greater outer one and a positive attenuation, but they are "
-            f"{self.inner:g} m, {self.outer:g} m and {self.attenuation:g} per metre; correct --tube.",
-        )
-
-    @classmethod
-    def parsed(cls, text: str) -> Tube:
-        """The tube that INNER:OUTER:ATTENUATION says. Errors: `InputError` for anything else."""
-        numbers = [number_in(word) for word in text.split(":")]
-        require(
-            len(numbers) == 3 and not any(map(math.isnan, numbers)),
-            f"--tube must be INNER:OUTER:ATTENUATION, diameters [m] and µ of the wall [1/m], but it is {shown(text)}; "
-            "write, for instance, 4e-3:4.5e-3:200.",
-        )
-        return cls(*numbers)
-
-    def transmission(self, views: Views) -> np.ndarray:
-        """Share of the light [V, W] that passes the wall, by column: `exp(-µ t)`, t the wall's length along the ray.
-
-        Of pixels as points; waves that its edges throw, `W` columns wide, are not in it. Errors: `InputError` for views
-        without a common axis.
-        """
-        require(views.shares_axis, "--tube goes with views about one axis, but these turn about others; leave it.")
-        columns = (np.arange(views.shape[1]) - 0.5 * (views.shape[1] - 1)) * views.pixel_size
-        x = columns + views.shifts[:, :1]
-        outer, inner = (2 * np.sqrt(np.maximum((d / 2) ** 2 - x**2, 0)) for d in (self.outer, self.inner))
-        return np.exp(-self.attenuation * (outer - inner))
-
-    def taken_out_of(self, scan: Scan) -> Scan:
-        """The scan as if without the tube, whose light is divided out of every frame."""
-        said = {"tube": f"{self.inner:g} m to {self.outer:g} m, {self.attenuation:g} per metre, divided out"}
-        return scan.divided(self.transmission(scan.views)[:, None, :].astype(np.float32), said)

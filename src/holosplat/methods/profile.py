@@ -21,10 +21,11 @@ from ..baselines import HolographicTV, holographic_tv
 from ..baselines.beyond import margins_of
 from ..baselines.tomography import plateau
 from ..checks import at_least, require
+from ..fit.residuals import set_aside
 from ..fit.smooth_volume import ContinuousPrior, VolumeProblem, descend
 from ..fit.whitened import WhitenedFrames
 from ..geometry import Grid
-from ..inference import Score
+from ..inference import Decision, Score, select
 from ..matter import DeltaBeta, Matter
 from ..memory import memory_kept
 from ..optics.coherence import joined_blur_px
@@ -43,6 +44,11 @@ SPECK = 27
 FEW_SPECKS = 0.1
 """Share of all matter up to which such pieces are taken for noise; if they hold more, they are matter."""
 
+NONE, SOME = "none", "some"
+FEWEST = 3
+"""Frames from which on one is predicted from the others."""
+UNSEEN = 4
+"""One frame in so many is set aside, one at least."""
 FIELDS = ("distance", "energy_kev", "bandwidth", "psf_sigma_px")
 """Constants that exposures have under their own names."""
 
@@ -163,22 +169,34 @@ class Profile:
 
     def __call__(self, constants: Constants) -> float:
         """½ χ² and prior of the likeliest volume in the support."""
-        return self._fitted(constants)[1]
+        return self.fitted(constants)[1]
 
     def score(self, constants: Constants, unseen: np.ndarray) -> Score:
         """How well the likeliest volume of the other frames predicts the frames `unseen` [V] bool."""
-        u, _ = self._of(~unseen)._fitted(constants)
+        u, _ = self._of(~unseen).fitted(constants)
         frames = self._of(unseen).frames(constants)
         lines = VolumeProblem(frames, self.options.prior, 1.0, self.options.start.backend).lines(u)
         with torch.no_grad():
             return Score.of(frames.known(frames.amplitudes(lines) - frames.measured))
+
+    def needs(self, name: str, values: Constants) -> Decision | None:
+        """Whether frames that are set aside are predicted better with the constant `name` as in `values` than with 0.
+
+        A comparison of `inference.select`, whose null is 0; None for too few frames.
+        """
+        if len(self) < FEWEST:
+            return None
+        unseen = set_aside(len(self), max(1, len(self) // UNSEEN))
+        scores = {each: self.score({**values, name: at}, unseen) for each, at in ((NONE, 0.0), (SOME, values[name]))}
+        return select(name, (NONE, SOME), lambda each, _: scores[each], by="frames set aside")
 
     def _of(self, chosen: np.ndarray) -> Profile:
         part = copy(self)
         part._scan, part._noise = self._scan[np.flatnonzero(chosen)], self._noise[np.flatnonzero(chosen)]
         return part
 
-    def _fitted(self, constants: Constants) -> tuple[Tensor, float]:
+    def fitted(self, constants: Constants) -> tuple[Tensor, float]:
+        """The likeliest volume in the support, and ½ χ² and prior."""
         with memory_kept():
             frames, options = self.frames(constants), self.options
             u = self._placed(self._volume(frames)) * self.support

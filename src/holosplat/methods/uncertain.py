@@ -11,13 +11,11 @@ import numpy as np
 
 from ..baselines.material import MaterialEstimate, estimate_ratio
 from ..checks import InputError, require
-from ..fit.residuals import set_aside
-from ..inference import select
 from ..matter import DeltaBeta, Known, KnownRatio, KnownSeveral, MaterialPrior
 from ..ranges import ranged
 from ..scan import Scan
 from .method import Task, shows_no_refraction
-from .profile import Profile, ProfileOptions, exposed
+from .profile import NONE, Profile, ProfileOptions, exposed
 
 STAGE = "uncertain constants"
 WIDE = 4.0
@@ -45,29 +43,11 @@ ENOUGH_AIR = 0.1
 
 Range = tuple[float, float]
 
-UNITS = {
-    "distance": " m",
-    "energy_kev": " keV",
-    "delta_beta": "",
-    "bandwidth": "",
-    "source_angle": " rad",
-    "psf_sigma_px": " pixels",
-}
-CALLED = {
-    "distance": "distance",
-    "energy_kev": "energy",
-    "delta_beta": "δ/β",
-    "bandwidth": "bandwidth",
-    "source_angle": "source size over its distance",
-    "psf_sigma_px": "blur of the detector",
-}
+UNITS = {"distance": " m", "energy_kev": " keV", "source_angle": " rad", "psf_sigma_px": " pixels"}
+CALLED = {"energy_kev": "energy", "delta_beta": "δ/β", "source_angle": "source over its distance"}
+CALLED |= {"psf_sigma_px": "blur of the detector", "distance": "distance", "bandwidth": "bandwidth"}
 WIDTHS = ("bandwidth", "source_angle", "psf_sigma_px")
 """Constants that may be 0, which holds unless the frames predict each other better with the likeliest value."""
-NONE, SOME, BY = "none", "some", "frames set aside"
-FEWEST = 3
-"""Frames from which on one is predicted from the others."""
-UNSEEN = 4
-"""One frame in so many is predicted from the others in that comparison, one at least."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +100,7 @@ class Determined:
 
     def line(self) -> str:
         """The same in words."""
-        unit, (least, most) = UNITS[self.name], self.given
+        unit, (least, most) = UNITS.get(self.name, ""), self.given
         known = f"{self.low:.4g} to {self.high:.4g}{unit}"
         said = f"by the frames, {known}" if self.told else "the frames say no more than the range"
         said += f"; given: {least:.4g} to {most:.4g}{unit}"
@@ -160,25 +140,14 @@ def determine(task: Task, uncertain: Uncertain, options: ProfileOptions | None =
 
 
 def without_idle(profile: Profile, found: tuple[Determined, ...]) -> tuple[Determined, ...]:
-    """`found` with 0 for each width that the frames do not need, all others as they were found.
-
-    A width is kept where `inference.select` takes it: frames are predicted by a volume of the other ones.
-    """
-    frames = len(profile)
-    unseen = set_aside(frames, max(1, frames // UNSEEN))
+    """`found` with 0 for each width that the frames do not need, all others as they were found."""
     for i, each in enumerate(found):
         if each.name not in WIDTHS:
             continue
         values = {one.name: one.value for one in found}
-        held = {NONE: values | {each.name: 0.0}, SOME: values}
-        enough = each.told and frames >= FEWEST
-        choice = NONE
-        if enough:
-            scores = {name: profile.score(values, unseen) for name, values in held.items()}
-            chosen = select(CALLED[each.name], (NONE, SOME), lambda name, _, of=scores: of[name], by=BY)
-            choice = chosen.choice
-        if choice == NONE:
-            remark = f"{chosen.line}; 0 is used" if enough else "0 is used"
+        chosen = profile.needs(each.name, values) if each.told else None
+        if chosen is None or chosen.choice == NONE:
+            remark = "0 is used" if chosen is None else f"{chosen.line}; 0 is used"
             none = replace(each, value=0.0, low=0.0, told=False, remark=remark)
             found = (*found[:i], none, *found[i + 1 :])
     return found

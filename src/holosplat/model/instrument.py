@@ -143,8 +143,9 @@ class Instrument:
             channels = lines.channels.to(self.device, self.dtype) * scale[:, :, None, None]
             planned = self._optical.distance if chosen is None else self._optical.distance[chosen.cpu().numpy()]
             distance = (torch.from_numpy(planned).to(ratio) if distance is None else distance) / ratio
-        if distance is None and psf_sigma_px is None:
+        if distance is None:
             path = colour.path if chosen is None else colour.path[chosen]
+            path = path if psf_sigma_px is None else path.corrected(psf_sigma=psf_sigma_px * self.oversample)
         else:
             path = self._path(colour.energies, chosen, distance, psf_sigma_px, self.path.beyond is not None)
         return hologram(channels, _refraction(colour.factors, lines.materials, chosen), path, self.backend)
