@@ -65,7 +65,9 @@ def amount(measured: Scan) -> float:
     material = FILLING.of("", ENERGY)
     at = {"delta_beta": material.ratio}
     return float(
-        Profile(prepared(Task(measured, MaterialPrior.known(material))), material.ratio, at, [at])._fitted(at)[0].sum()
+        Profile(prepared(Task(measured, MaterialPrior.known(material))), material.ratio, at, [at], OPTIONS)
+        .fitted(at)[0]
+        .sum()
     )
 
 

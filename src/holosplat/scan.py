@@ -74,10 +74,8 @@ class Exposures:
             checked_distance(float(z))
         finite("psf_sigma_px", self.psf_sigma_px)
         finite("time", self.time)
-        finite("bandwidth", self.bandwidth)
-        for width in np.unique(self.bandwidth):
-            within = f"bandwidth must lie between 0 and {MOST_BANDWIDTH:g}, as a share of the energy"
-            require(0 <= width <= MOST_BANDWIDTH, f"{within}, but it is {width:g}; correct it.")
+        for width in np.unique(self.bandwidth[self.bandwidth != 0]):
+            in_range("bandwidth", float(width), 1e-9, MOST_BANDWIDTH)
         worst = float(self.psf_sigma_px.max(initial=0.0))
         require(bool(np.all(self.psf_sigma_px >= 0)), "psf_sigma_px must not be negative; correct it.")
         require(
@@ -87,8 +85,7 @@ class Exposures:
     @classmethod
     def of(cls, views: Views, energy_kev: float, distance: float, psf_sigma_px: float = 0.0) -> Exposures:
         """Exposures that share one distance [m] and one point-spread function, all at time 0."""
-        n = len(views)
-        return cls(views, np.full(n, energy_kev), np.full(n, distance), np.full(n, psf_sigma_px), np.zeros(n))
+        return cls(views, *(np.full(len(views), value) for value in (energy_kev, distance, psf_sigma_px, 0.0)))
 
     def __len__(self) -> int:
         return len(self.views)
@@ -426,6 +423,4 @@ class Scan:
 
 def interleaved_split(count: int, every: int = 4) -> np.ndarray:
     """[count] bool: True for each `every`-th frame (the last of every group), which is held out; 0 holds out none."""
-    if every <= 0:
-        return np.zeros(count, dtype=bool)
-    return np.arange(count) % every == every - 1
+    return np.arange(count) % max(every, 1) == every - 1

@@ -190,7 +190,7 @@ def test_light_of_one_energy_costs_one_set_of_waves(monkeypatch):
 
 
 def test_bad_input_is_named():
-    with pytest.raises(InputError, match=r"bandwidth must lie between 0 and 0\.5, as a share of the energy, but"):
+    with pytest.raises(InputError, match=r"bandwidth must lie between 1e-09 and 0\.5"):
         exposures(0.7)
     far = exposures(0.3, 1, 400.0)
     with pytest.raises(InputError, match=f"takes more than {MOST_ENERGIES} energies"):
