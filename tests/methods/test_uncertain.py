@@ -240,11 +240,11 @@ def test_one_energy_holds_unless_frames_are_predicted_better_with_a_bandwidth(ga
 
 
 def test_frames_set_aside_are_predicted_by_a_volume_of_the_others(scan):
-    """At the true distance better than at a wrong one."""
+    """Without a blur, as they are, better than with one of four pixels."""
     at = {"distance": 0.05, "delta_beta": MATERIAL.ratio}
     profile = Profile(Task(scan, RATIO), MATERIAL.ratio, at, [at], replace(QUICK, iterations=3))
     unseen = np.array([False, False, True, False, False])
-    true, wrong = profile.score(at, unseen), profile.score(at | {"distance": 0.2}, unseen)
+    true, wrong = profile.score(at, unseen), profile.score(at | {"psf_sigma_px": 4.0}, unseen)
     assert true.frames == 1
     assert true.gain_over(wrong)[0] > 0
 

@@ -44,7 +44,6 @@ SPECK = 27
 FEW_SPECKS = 0.1
 """Share of all matter up to which such pieces are taken for noise; if they hold more, they are matter."""
 
-NONE, SOME = "none", "some"
 FEWEST = 3
 """Frames from which on one is predicted from the others."""
 UNSEEN = 4
@@ -187,8 +186,8 @@ class Profile:
         if len(self) < FEWEST:
             return None
         unseen = set_aside(len(self), max(1, len(self) // UNSEEN))
-        scores = {each: self.score({**values, name: at}, unseen) for each, at in ((NONE, 0.0), (SOME, values[name]))}
-        return select(name, (NONE, SOME), lambda each, _: scores[each], by="frames set aside")
+        scores = {each: self.score({**values, name: at}, unseen) for each, at in (("0", 0.0), (name, values[name]))}
+        return select(name, ("0", name), lambda each, _: scores[each], by="frames set aside")
 
     def _of(self, chosen: np.ndarray) -> Profile:
         part = copy(self)

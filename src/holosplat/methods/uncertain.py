@@ -15,7 +15,7 @@ from ..matter import DeltaBeta, Known, KnownRatio, KnownSeveral, MaterialPrior
 from ..ranges import ranged
 from ..scan import Scan
 from .method import Task, shows_no_refraction
-from .profile import NONE, Profile, ProfileOptions, exposed
+from .profile import Profile, ProfileOptions, exposed
 
 STAGE = "uncertain constants"
 WIDE = 4.0
@@ -146,7 +146,7 @@ def without_idle(profile: Profile, found: tuple[Determined, ...]) -> tuple[Deter
             continue
         values = {one.name: one.value for one in found}
         chosen = profile.needs(each.name, values) if each.told else None
-        if chosen is None or chosen.choice == NONE:
+        if chosen is None or chosen.choice != each.name:
             remark = "0 is used" if chosen is None else f"{chosen.line}; 0 is used"
             none = replace(each, value=0.0, low=0.0, told=False, remark=remark)
             found = (*found[:i], none, *found[i + 1 :])
