@@ -174,3 +174,25 @@ def droplets() -> str:
         for r in rows
     ]
     return markdown((*head, "missed depth, at most (mm)"), lines)
+
+
+CELLS = "python benchmarks/red_cells.py FOLDER"
+QUANTITIES = {"distance_um": "distance [µm]", "diameter_um": "diameter [µm]", "volume_um3": "volume [µm³]"}
+QUANTITIES |= {"optical_volume_um3": "index × volume [µm³]", "dry_mass_pg": "dry mass [pg]"}
+
+
+@table("red_cells", CELLS, "10 minutes", "red_cells.csv")
+def red_cells() -> str:
+    """Single cells by their shape at rest: likeliest values, 95 % intervals, and residuals."""
+    rows = [r for r in read("red_cells.csv") if r["row"] == "cell"]
+    found = {(r["cell"], r["quantity"]): r for r in rows}
+    lines = []
+    for cell in ("Hypertonic", "Isotonic", "Hypotonic"):
+        intervals = []
+        for quantity in QUANTITIES:
+            one = found[cell, quantity]
+            middle, low, high = (f"{float(one[name]):.3g}" for name in ("value", "low", "high"))
+            intervals.append(f"{middle} ({low} to {high})")
+        left, noise = (rounded(found[cell, name]["value"], 3) for name in ("misfit_rms", "noise_rms"))
+        lines.append([cell.lower(), *intervals, f"{left}, {noise}"])
+    return markdown(("medium", *QUANTITIES.values(), "residual, noise"), lines)

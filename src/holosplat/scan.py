@@ -23,6 +23,8 @@ PIXEL_RANGE_M = (1e-10, 1e-2)
 DISTANCE_RANGE_M = (1e-9, 1e4)
 MOST_BLUR_PX = 1000.0
 """Blur beyond which a frame is one grey."""
+MOST_BANDWIDTH = 0.5
+PER_FRAME = ("energy_kev", "distance", "psf_sigma_px", "time", "bandwidth")
 """Limits of a distance [m] that is not zero; at 0, in contact, there is absorption alone."""
 
 
@@ -35,6 +37,7 @@ class Exposures:
     psf_sigma_px: [N] standard deviations of the Gaussian point-spread function [detector pixels].
     time: [N] seconds since the first frame.
     reference_kev: the energy [keV] for which δ and β of matter are given (None: the energy of the first frame).
+    bandwidth: [N] relative full widths at half maximum ΔE/E of a Gaussian spectrum about the energy; 0: one energy.
 
     A number stands for N equal ones. Errors: `InputError` for numbers out of range.
 
@@ -56,12 +59,13 @@ class Exposures:
     psf_sigma_px: np.ndarray
     time: np.ndarray
     reference_kev: float | None = None
+    bandwidth: np.ndarray = field(default_factory=lambda: np.zeros(()))
 
     def __post_init__(self) -> None:
         count = len(self.views)
         for size in np.unique(self.views.pixel_sizes):
             in_range("pixel size", float(size), *PIXEL_RANGE_M, unit="metres")
-        for name in ("energy_kev", "distance", "psf_sigma_px", "time"):
+        for name in PER_FRAME:
             array = np.broadcast_to(np.asarray(getattr(self, name), dtype=np.float64), (count,))
             object.__setattr__(self, name, array.copy())
         for energy in (*self.energy_kev, *([] if self.reference_kev is None else [self.reference_kev])):
@@ -70,6 +74,8 @@ class Exposures:
             checked_distance(float(z))
         finite("psf_sigma_px", self.psf_sigma_px)
         finite("time", self.time)
+        for width in np.unique(self.bandwidth[self.bandwidth != 0]):
+            in_range("bandwidth", float(width), 1e-9, MOST_BANDWIDTH)
         worst = float(self.psf_sigma_px.max(initial=0.0))
         require(bool(np.all(self.psf_sigma_px >= 0)), "psf_sigma_px must not be negative; correct it.")
         require(
@@ -79,8 +85,7 @@ class Exposures:
     @classmethod
     def of(cls, views: Views, energy_kev: float, distance: float, psf_sigma_px: float = 0.0) -> Exposures:
         """Exposures that share one distance [m] and one point-spread function, all at time 0."""
-        n = len(views)
-        return cls(views, np.full(n, energy_kev), np.full(n, distance), np.full(n, psf_sigma_px), np.zeros(n))
+        return cls(views, *(np.full(len(views), value) for value in (energy_kev, distance, psf_sigma_px, 0.0)))
 
     def __len__(self) -> int:
         return len(self.views)
@@ -89,11 +94,8 @@ class Exposures:
         return replace(
             self,
             views=self.views[index],
-            energy_kev=self.energy_kev[index],
-            distance=self.distance[index],
-            psf_sigma_px=self.psf_sigma_px[index],
-            time=self.time[index],
             reference_kev=self.reference_kev if self.has_one_energy else self.reference_energy,
+            **{name: getattr(self, name)[index] for name in PER_FRAME},
         )
 
     @property
@@ -421,6 +423,4 @@ class Scan:
 
 def interleaved_split(count: int, every: int = 4) -> np.ndarray:
     """[count] bool: True for each `every`-th frame (the last of every group), which is held out; 0 holds out none."""
-    if every <= 0:
-        return np.zeros(count, dtype=bool)
-    return np.arange(count) % every == every - 1
+    return np.arange(count) % max(every, 1) == every - 1

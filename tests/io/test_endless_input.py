@@ -18,11 +18,12 @@ from holosplat.checks import InputError, positive
 from holosplat.geometry import Grid
 from holosplat.io.beams import MOST_VIEWS, read_beams
 from holosplat.io.formats import read_volume_file
+from holosplat.io.half_acquisition import Tube
 from holosplat.io.leftovers import LOCK
 from holosplat.io.lock import sole_writer, writer_of
 from holosplat.io.ome import read_ome_tiff, write_ome_tiff
 from holosplat.io.pvd import find_snapshots, read_pvd
-from holosplat.io.reading import Reading, Tube, ends_of, marked, read_angles
+from holosplat.io.reading import Reading, ends_of, marked, read_angles
 from holosplat.io.stacks import all_images, stack_of
 from holosplat.io.table import Table
 from holosplat.io.vtk import read_meshes

@@ -12,10 +12,12 @@ import pytest
 from holosplat.checks import InputError
 from holosplat.geometry import Views, rotation_y
 from holosplat.io.formats import read, read_as, run_reading, run_source
+from holosplat.io.images import write_tiff
 from holosplat.io.json import write_json
 from holosplat.io.nxtomo import write_scan
 from holosplat.io.reading import Part, Reading, Told, read_angles
 from holosplat.scan import Exposures, Scan
+from holosplat.workflows.provenance import scan_hash
 
 N, SHAPE, PIXEL = 7, (9, 13), 1e-6
 
@@ -194,3 +196,29 @@ def test_a_time_is_taken_before_frames_are_counted():
     found = Part(time_frame=1, views="0,2").of(series)
     np.testing.assert_array_equal(found.frames, series.frames[[3, 5]])
     assert not found.exposures.time.any()
+
+
+def test_widths_are_said_beside_files_and_kept_by_them(file, tmp_path):
+    """A source of 4 µm at 0.2 m and a distance of 0.1 m blurs by 2 µm: two pixels beside those of the detector."""
+    said = Told(bandwidth=0.03, source_size=4e-6, source_distance=0.2, psf_sigma_px=1.5)
+    placed = said.placed(a_scan())
+    assert placed.exposures.bandwidth == pytest.approx(np.full(N, 0.03))
+    assert placed.exposures.psf_sigma_px == pytest.approx(np.full(N, 2.5))
+    write_scan(tmp_path / "again.nxs", placed)
+    write_tiff(tmp_path / "images", placed)
+    for path in ("again.nxs", "images"):
+        kept = read(tmp_path / path)
+        assert kept.exposures.bandwidth == pytest.approx(np.full(N, 0.03))
+        assert scan_hash(kept) != scan_hash(a_scan())
+    assert not read(file).exposures.bandwidth.any()
+
+
+def test_widths_said_as_ranges_are_left_open():
+    said = Told(bandwidth="0.01:0.1", source_size="1e-6:4e-6", source_distance=0.5, psf_sigma_px="0.2:1")
+    assert said.uncertain() == {"bandwidth": (0.01, 0.1), "source_angle": (2e-6, 8e-6), "psf_sigma_px": (0.2, 1.0)}
+    assert said.at_middle() == Told(source_distance=0.5)
+    assert said.found({"bandwidth": 0.03, "psf_sigma_px": 0.0}) == Told(
+        bandwidth=0.03, source_distance=0.5, psf_sigma_px=0.0
+    )
+    with pytest.raises(InputError, match="--source-size needs --source-distance"):
+        Told(source_size=1e-6).placed(a_scan())

@@ -8,8 +8,9 @@ import pytest
 from holosplat.checks import InputError
 from holosplat.geometry import Views, rotation_tilted
 from holosplat.io.formats import read_as
+from holosplat.io.half_acquisition import Tube
 from holosplat.io.nxtomo import write_scan
-from holosplat.io.reading import Part, Reading, Told, Tube
+from holosplat.io.reading import Part, Reading, Told
 from holosplat.scan import Exposures, Scan
 
 SHAPE, PIXEL, COLUMN = (3, 21), 1e-4, 8.0

@@ -16,11 +16,21 @@ from holosplat.baselines import HolographicTV
 from holosplat.baselines.beyond import rows_beyond
 from holosplat.baselines.material import estimate_ratio
 from holosplat.checks import InputError
+from holosplat.inference import Score
 from holosplat.matter import MaterialPrior
 from holosplat.methods import Task
 from holosplat.methods.method import quiet
-from holosplat.methods.profile import Profile, ProfileOptions, without_specks
-from holosplat.methods.uncertain import Determined, Search, Uncertain, at_energy, determine, likeliest_ratio, told
+from holosplat.methods.profile import Profile, ProfileOptions, exposed, without_specks
+from holosplat.methods.uncertain import (
+    Determined,
+    Search,
+    Uncertain,
+    at_energy,
+    determine,
+    likeliest_ratio,
+    told,
+    without_idle,
+)
 
 RATIO = MaterialPrior.of_ratio(MATERIAL.ratio)
 QUICK = ProfileOptions(
@@ -201,3 +211,49 @@ def test_specks_of_noise_are_no_support_but_small_matter_is():
     small[2::5, 2::5, 2::5] = 1.0
     alone = (small > 0.1).numpy()
     assert np.array_equal(without_specks(small, alone), alone)
+
+
+class Blurred(Profile):
+    """A profile whose frames are predicted better with a bandwidth, by so large a part."""
+
+    def __init__(self, gain: float, frames: int = 8) -> None:
+        self._gain, self._frames = gain, frames
+
+    def __len__(self) -> int:
+        return self._frames
+
+    def score(self, constants, unseen) -> Score:
+        draw = torch.Generator().manual_seed(1)
+        left = torch.randn(int(unseen.sum()), 64, 64, generator=draw)
+        return Score.of(left * (1 - self._gain * (constants["bandwidth"] > 0)))
+
+
+@pytest.mark.parametrize(("gain", "frames", "kept"), [(0.1, 8, True), (0.005, 8, False), (0.1, 2, False)])
+def test_one_energy_holds_unless_frames_are_predicted_better_with_a_bandwidth(gain, frames, kept):
+    found = Determined("bandwidth", 0.03, 0.02, 0.04, (0.01, 0.1), True)
+    other = Determined("energy_kev", 20.0, 19.9, 20.1, (19.0, 21.0), True)
+    width, energy = without_idle(Blurred(gain, frames), (found, other))  # type: ignore[arg-type]
+    assert energy == other
+    assert width.value == (0.03 if kept else 0.0)
+    assert width.told == kept
+    assert kept or "0 is used" in width.line()
+
+
+def test_frames_set_aside_are_predicted_by_a_volume_of_the_others(scan):
+    """Without a blur, as they are, better than with one of four pixels."""
+    at = {"distance": 0.05, "delta_beta": MATERIAL.ratio}
+    profile = Profile(Task(scan, RATIO), MATERIAL.ratio, at, [at], replace(QUICK, iterations=3))
+    unseen = np.array([False, False, True, False, False])
+    true, wrong = profile.score(at, unseen), profile.score(at | {"psf_sigma_px": 4.0}, unseen)
+    assert true.frames == 1
+    assert true.gain_over(wrong)[0] > 0
+
+
+def test_widths_of_light_and_detector_are_those_of_the_exposures(scan):
+    """A source of 1 mrad at 0.05 m blurs by 50 µm; a detector's blur is in pixels of the scan."""
+    seen = exposed(scan, {"bandwidth": 0.03, "psf_sigma_px": 3.0, "source_angle": 8e-5}).exposures
+    assert seen.bandwidth == pytest.approx(np.full(5, 0.03))
+    assert seen.psf_sigma_px == pytest.approx(np.full(5, 5.0))  # pixels of 1 µm: √(3² + 4²)
+    at = {"delta_beta": MATERIAL.ratio}
+    binned = Profile(Task(scan, RATIO), MATERIAL.ratio, at, [at], replace(QUICK, width=23))
+    assert binned.frames({"psf_sigma_px": 3.0}).train.exposures.psf_sigma_px == pytest.approx(np.full(5, 1.5))

@@ -113,7 +113,7 @@ class Asked:
             "--refine finds each frame by itself, but --motion flow has the same beams many times; find their one "
             "geometry with holosplat align, and reconstruct the file that it writes without --refine.",
         )
-        uncertain = Uncertain(**reading.told.ranges(), **self.matter.ranges())
+        uncertain = Uncertain(**reading.told.uncertain(), **self.matter.ranges())
         kind, light = self.how.kind_of_matter(), self.illumination.options()
         return {"matter": kind, "light": light, "uncertain": uncertain, "refine": refine}
 
@@ -225,8 +225,8 @@ def _scored(
     from ..workflows.reconstruction import instants_of
     from .track import report_of_middle
 
-    found = {each.name: each.value for each in result.constants if each.name in reading.told.ranges()}
-    folder.write_source(run_source(scan, replace(reading, told=replace(reading.told, **found))))
+    found = reading.told.found({each.name: each.value for each in result.constants})
+    folder.write_source(run_source(scan, replace(reading, told=found)))
     placed = result.placed(measured)
     evaluation = score(result, placed, None)
     if instants_of(folder):

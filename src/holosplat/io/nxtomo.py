@@ -170,6 +170,8 @@ def _write_instrument(instrument: h5py.Group, exposures: Exposures, raw: RawLayo
     else:
         source["probe"] = "x-ray"
         _put(beam, "incident_energy", energy, "keV")
+    if np.any(exposures.bandwidth):
+        _put(beam, "incident_energy_spread", exposures.energy_kev * exposures.bandwidth, "keV")
     detector = _group(instrument, "detector", "NXdetector")
     shape = (len(exposures), *exposures.views.shape)
     data = room_for(detector, "data", shape, np.uint16 if raw else np.float32, chunk=(1, *shape[1:]))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -17,13 +17,17 @@ from ..units import photon_energy
 from .angles import read_angles, tell_angles, tell_views
 
 if TYPE_CHECKING:
-    from ..geometry import Views
     from ..scan import Scan
     from .beams import Beams
 
 Sense = Literal["clockwise", "anticlockwise"]
 
-OWN_WAY = ("wavelength", "medium_index", "angles", "axis_column", "sense", "tube", "exposures", "allow_external")
+WIDTHS = ("bandwidth", "source_size", "psf_sigma_px")
+"""Fields of `Told` that say how wide something is, of which a range means that it may be nothing, too."""
+OWN_WAY = (
+    *("wavelength", "medium_index", "angles", "axis_column", "sense", "tube", "exposures", "allow_external"),
+    *WIDTHS,
+)
 """Fields of `Told` that no loader takes by their own name."""
 
 
@@ -44,6 +48,14 @@ class Told:
     """Effective pixel size [m] (default: as the files say)."""
     source_distance: Positive | None = None
     """Distance from a point source to the sample [m]; distance and pixel are then those of the detector itself."""
+    bandwidth: float | str | None = None
+    """Relative full width at half maximum ΔE/E of the spectrum, or a range LOW:HIGH for `reconstruct` (default: as the
+    files say, or 0)."""
+    source_size: float | str | None = None
+    """Standard deviation of the source [m], whose blur joins that of the detector, or such a range; with
+    --source-distance."""
+    psf_sigma_px: float | str | None = None
+    """Standard deviation of the detector's blur [pixels], or such a range (default: as the files say, or 0)."""
     angles: Path | None = None
     """Text file of the frames' angles [degrees], one a line, or in a column that its first line names (default: as the
     files say)."""
@@ -103,12 +115,30 @@ class Told:
 
     def ranges(self) -> dict[str, tuple[float, float]]:
         """What is said as a range LOW:HIGH, by name."""
-        said = {"energy_kev": self.energy_kev, "distance": self.distance}
+        said = {name: getattr(self, name) for name in ("energy_kev", "distance", *WIDTHS)}
         return {name: ends_of(name, value) for name, value in said.items() if isinstance(value, str)}
 
+    def uncertain(self) -> dict[str, tuple[float, float]]:
+        """The same as a reconstruction has it: of a source it is the angle that its size subtends [rad]."""
+        found = self.ranges()
+        if "source_size" in found:
+            low, high = found.pop("source_size")
+            found["source_angle"] = low / self._from_source(), high / self._from_source()
+        return found
+
     def at_middle(self) -> Told:
-        """The same with the geometric mean of each range."""
-        return replace(self, **{name: math.sqrt(low * high) for name, (low, high) in self.ranges().items()})
+        """The same with the geometric mean of each range, and without the widths, which may be none."""
+        middle = {name: math.sqrt(low * high) for name, (low, high) in self.ranges().items()}
+        return replace(self, **{name: None if name in WIDTHS else value for name, value in middle.items()})
+
+    def found(self, constants: Mapping[str, float]) -> Told:
+        """The same with what a reconstruction found for the ranges; a source's size is among its constants alone."""
+        return replace(self, **{name: constants.get(name) for name in self.ranges()})
+
+    def _from_source(self) -> float:
+        if self.source_distance is None:
+            raise InputError("--source-size needs --source-distance, for it blurs by their ratio; give both.")
+        return self.source_distance
 
     def given(self, takes: Sequence[str] = ()) -> dict[str, Any]:
         """The values for a loader, by name (`Loader.takes`); angles as `angles_deg` [N].
@@ -142,12 +172,27 @@ class Told:
     def placed(self, scan: Scan) -> Scan:
         """The scan in the exposures of --exposures, or with the axis and the sense of rotation that are said."""
         if (beams := self._beams()) is not None:
-            return beams.applied(scan)
+            return self._of_light(beams.applied(scan))
         views = scan.views
         if self.axis_column is not None:
             views = views.about_column(self.axis_column)
         views = views if self.sense == "clockwise" else views.turned_back()
-        return scan if views is scan.views else scan.with_views(views)
+        return self._of_light(scan if views is scan.views else scan.with_views(views))
+
+    def _of_light(self, scan: Scan) -> Scan:
+        """The scan with the widths of spectrum, source and detector that are said as numbers."""
+        said = {name: value for name in WIDTHS if isinstance(value := getattr(self, name), float | int)}
+        if not said:
+            return scan
+        from ..optics.coherence import joined_blur_px, source_blur
+
+        size = said.pop("source_size", None)
+        exposures = replace(scan.exposures, **said)
+        if size is not None:
+            blur = source_blur(size, self._from_source(), exposures.distance)
+            sigma = joined_blur_px(exposures.psf_sigma_px, blur, exposures.views.pixel_sizes)
+            exposures = replace(exposures, psf_sigma_px=sigma)
+        return scan.taken(exposures)
 
     def _beams(self) -> Beams | None:
         """What --exposures names. Errors: `InputError` for options that say the same."""
@@ -224,7 +269,11 @@ class Reading:
 
             scan = stitched(scan)
         tell_views(scan)
-        return self.part.of(scan if self.told.tube is None else Tube.parsed(self.told.tube).taken_out_of(scan))
+        if self.told.tube is not None:
+            from .half_acquisition import Tube
+
+            scan = Tube.parsed(self.told.tube).taken_out_of(scan)
+        return self.part.of(scan)
 
     def as_table(self) -> dict[str, Any]:
         """What differs from the default, by field, ready for JSON; paths are absolute. `time_frame` is not there."""
@@ -334,49 +383,3 @@ def _whole(option: str, word: str) -> int:
     if found is None or abs(found) > LARGEST:
         raise InputError(f"{option} must be made of whole numbers, as in 0:91:8 or 3,5, but it says {shown(word)}.")
     return found
-
-
-@dataclass(frozen=True)
-@ranged
-class Tube:
-    """A round tube about the rotation axis. inner, outer: diameters [m]; attenuation: µ of its wall [1/m]."""
-
-    inner: float
-    outer: float
-    attenuation: float
-
-    def __post_init__(self) -> None:
-        good = 0 <= self.inner < self.outer < math.inf and 0 < self.attenuation < math.inf
-        require(
-            good,
-            "a tube must have an inner diameter from 0, a greater outer one and a positive attenuation, but they are "
-            f"{self.inner:g} m, {self.outer:g} m and {self.attenuation:g} per metre; correct --tube.",
-        )
-
-    @classmethod
-    def parsed(cls, text: str) -> Tube:
-        """The tube that INNER:OUTER:ATTENUATION says. Errors: `InputError` for anything else."""
-        numbers = [number_in(word) for word in text.split(":")]
-        require(
-            len(numbers) == 3 and not any(map(math.isnan, numbers)),
-            f"--tube must be INNER:OUTER:ATTENUATION, diameters [m] and µ of the wall [1/m], but it is {shown(text)}; "
-            "write, for instance, 4e-3:4.5e-3:200.",
-        )
-        return cls(*numbers)
-
-    def transmission(self, views: Views) -> np.ndarray:
-        """Share of the light [V, W] that passes the wall, by column: `exp(-µ t)`, t the wall's length along the ray.
-
-        Of pixels as points; waves that its edges throw, `W` columns wide, are not in it. Errors: `InputError` for views
-        without a common axis.
-        """
-        require(views.shares_axis, "--tube goes with views about one axis, but these turn about others; leave it.")
-        columns = (np.arange(views.shape[1]) - 0.5 * (views.shape[1] - 1)) * views.pixel_size
-        x = columns + views.shifts[:, :1]
-        outer, inner = (2 * np.sqrt(np.maximum((d / 2) ** 2 - x**2, 0)) for d in (self.outer, self.inner))
-        return np.exp(-self.attenuation * (outer - inner))
-
-    def taken_out_of(self, scan: Scan) -> Scan:
-        """The scan as if without the tube, whose light is divided out of every frame."""
-        said = {"tube": f"{self.inner:g} m to {self.outer:g} m, {self.attenuation:g} per metre, divided out"}
-        return scan.divided(self.transmission(scan.views)[:, None, :].astype(np.float32), said)

@@ -54,6 +54,8 @@ TIME = "sample/time"
 COUNT_TIMES = (DETECTOR + "count_time", "control/count_time")
 SAME_TIME = 0.01
 """Share by which times of exposure differ that were set alike."""
+ENERGY_SPREAD = "instrument/beam/incident_energy_spread"
+"""Full width at half maximum of the spectrum, in the unit of an energy (NXbeam)."""
 PSF_SIGMA = "instrument/detector/psf_sigma"
 SPLIT = "split"
 PROVENANCE = "process/provenance"
@@ -83,7 +85,8 @@ def open_scan(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Iterator[
         energy, distance = _energies(fields, kinds, given), _distances(fields, kinds, given)
         is_test = _split(fields, kinds)
         require(bool((psf_sigma >= 0).all()), f"{fields.label(PSF_SIGMA)} must not be negative; correct it.")
-        exposures = Exposures(views, energy, distance, psf_sigma, time)
+        spread = _optional(fields, kinds, ENERGY_SPREAD, ENERGY_UNITS, "keV") / energy
+        exposures = Exposures(views, energy, distance, psf_sigma, time, bandwidth=spread)
         flips = flips_of(fields)
         data = fields.need(*DATA_NAMES)
         yield ScanFile(

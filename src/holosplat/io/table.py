@@ -128,7 +128,7 @@ def beam_table(scan: Scan) -> dict[str, Any]:
 def exposure_table(exposures: Exposures, n: int) -> dict[str, Any]:
     """Frame `n`: `rotation` [3, 3], `shift_m` [2], `distance_m`, `psf_sigma_px`, `time_s`; floats are kept exactly.
 
-    `energy_kev` and `pixel_size_m` too, where frames have several.
+    `energy_kev` and `pixel_size_m` too, where frames have several, and `bandwidth`, where any has one.
     """
     views = exposures.views
     energy = {} if exposures.has_one_energy else {"energy_kev": float(exposures.energy_kev[n])}
@@ -141,6 +141,7 @@ def exposure_table(exposures: Exposures, n: int) -> dict[str, Any]:
         "distance_m": float(exposures.distance[n]),
         "psf_sigma_px": float(exposures.psf_sigma_px[n]),
         "time_s": float(exposures.time[n]),
+        **({"bandwidth": float(exposures.bandwidth[n])} if np.any(exposures.bandwidth) else {}),
     }
 
 
@@ -156,8 +157,8 @@ def read_exposures(beam: Table, frames: Sequence[Table], shape: tuple[int, int])
     pixel_sizes = np.array([_per_frame(beam, f, "pixel_size_m", None) for f in frames])
     try:
         views = Views.of_pixels(np.array(rotations), np.array(shifts), shape, pixel_sizes)
-        energy, distance, psf_sigma, time = (np.array(v) for v in values)
-        return Exposures(views, energy, distance, psf_sigma, time)
+        energy, distance, psf_sigma, time, bandwidth = (np.array(v) for v in values)
+        return Exposures(views, energy, distance, psf_sigma, time, bandwidth=bandwidth)
     except InputError as error:
         raise InputError(f"{beam.path}: {error}") from None
 
@@ -172,7 +173,7 @@ def in_order(head: Table, entries: Sequence[Table]) -> np.ndarray:
     return np.argsort(found)
 
 
-_NUMBERS = (("energy_kev", None), ("distance_m", None), ("psf_sigma_px", 0.0), ("time_s", 0.0))
+_NUMBERS = (("energy_kev", None), ("distance_m", None), ("psf_sigma_px", 0.0), ("time_s", 0.0), ("bandwidth", 0.0))
 """Numbers of a frame, in the order of `Exposures`, with their values if they are left out."""
 
 

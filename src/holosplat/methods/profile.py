@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from typing import cast
 
@@ -20,11 +21,14 @@ from ..baselines import HolographicTV, holographic_tv
 from ..baselines.beyond import margins_of
 from ..baselines.tomography import plateau
 from ..checks import at_least, require
+from ..fit.residuals import set_aside
 from ..fit.smooth_volume import ContinuousPrior, VolumeProblem, descend
 from ..fit.whitened import WhitenedFrames
 from ..geometry import Grid
+from ..inference import Decision, Score, select
 from ..matter import DeltaBeta, Matter
 from ..memory import memory_kept
+from ..optics.coherence import joined_blur_px
 from ..optics.noise_model import NoiseModel
 from ..optics.sampling import fringe_sampling
 from ..ranges import Share, ranged
@@ -40,8 +44,15 @@ SPECK = 27
 FEW_SPECKS = 0.1
 """Share of all matter up to which such pieces are taken for noise; if they hold more, they are matter."""
 
+FEWEST = 3
+"""Frames from which on one is predicted from the others."""
+UNSEEN = 4
+"""One frame in so many is set aside, one at least."""
+FIELDS = ("distance", "energy_kev", "bandwidth", "psf_sigma_px")
+"""Constants that exposures have under their own names."""
+
 Constants = Mapping[str, float]
-"""Values of what is uncertain, by name: `distance` [m], `energy_kev` [keV], `delta_beta`."""
+"""Values of what is uncertain, by the names of `Uncertain`."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +114,7 @@ class Profile:
     ) -> None:
         self.options, self._ratio, self._sign = options, ratio, task.prior.delta_sign
         factor = task.scan.largest_binning(math.ceil(max(task.scan.views.shape) / options.width))
-        self._scan = task.scan.binned(factor)
+        self._scan, self._binned = task.scan.binned(factor), factor
         contrast = torch.from_numpy(self._scan.frames - 1).double().square().mean(dim=(1, 2))
         noise = task.noise.binned(factor)
         white = (noise.white.square() + options.doubt**2 * contrast).sqrt()
@@ -120,6 +131,9 @@ class Profile:
         self._peak = plateau(first) / float((first * self.support).sum() / self.support.sum())
         """The level of matter over its mean in the support. The prior's unit must not vary by chance from fit to fit,
         as a plateau does, for the larger it is, the likelier are all slopes."""
+
+    def __len__(self) -> int:
+        return len(self._scan)
 
     def air(self) -> float:
         """Part of all pixels whose rays pass beside the support."""
@@ -141,7 +155,8 @@ class Profile:
         return WhitenedFrames(scan, material, self._noise, backend=backend, oversample=samples, beyond=self._beyond)
 
     def _exposed(self, constants: Constants) -> Scan:
-        return exposed(self._scan, constants)
+        blur = {"psf_sigma_px": constants["psf_sigma_px"] / self._binned} if "psf_sigma_px" in constants else {}
+        return exposed(self._scan, {**constants, **blur})
 
     def _volume(self, frames: WhitenedFrames) -> VoxelGrid:
         values, grid = holographic_tv(frames.train, frames.material, self.options.start, quiet)
@@ -153,6 +168,34 @@ class Profile:
 
     def __call__(self, constants: Constants) -> float:
         """½ χ² and prior of the likeliest volume in the support."""
+        return self.fitted(constants)[1]
+
+    def score(self, constants: Constants, unseen: np.ndarray) -> Score:
+        """How well the likeliest volume of the other frames predicts the frames `unseen` [V] bool."""
+        u, _ = self._of(~unseen).fitted(constants)
+        frames = self._of(unseen).frames(constants)
+        lines = VolumeProblem(frames, self.options.prior, 1.0, self.options.start.backend).lines(u)
+        with torch.no_grad():
+            return Score.of(frames.known(frames.amplitudes(lines) - frames.measured))
+
+    def needs(self, name: str, values: Constants) -> Decision | None:
+        """Whether frames that are set aside are predicted better with the constant `name` as in `values` than with 0.
+
+        A comparison of `inference.select`, whose null is 0; None for too few frames.
+        """
+        if len(self) < FEWEST:
+            return None
+        unseen = set_aside(len(self), max(1, len(self) // UNSEEN))
+        scores = {each: self.score({**values, name: at}, unseen) for each, at in (("0", 0.0), (name, values[name]))}
+        return select(name, ("0", name), lambda each, _: scores[each], by="frames set aside")
+
+    def _of(self, chosen: np.ndarray) -> Profile:
+        part = copy(self)
+        part._scan, part._noise = self._scan[np.flatnonzero(chosen)], self._noise[np.flatnonzero(chosen)]
+        return part
+
+    def fitted(self, constants: Constants) -> tuple[Tensor, float]:
+        """The likeliest volume in the support, and ½ χ² and prior."""
         with memory_kept():
             frames, options = self.frames(constants), self.options
             u = self._placed(self._volume(frames)) * self.support
@@ -164,12 +207,19 @@ class Profile:
                     level = self._peak * float(u.sum() / self.support.sum())
                     problem = VolumeProblem(frames, options.prior, level, options.start.backend, self.support)
                     u, values = descend(problem, u, options.iterations)
-            return values[-1]
+            return u, values[-1]
 
 
 def exposed(scan: Scan, constants: Constants) -> Scan:
-    """`scan` at the distance and energy that `constants` say; δ and β hold at that energy then."""
-    changes = {name: np.full(len(scan), value) for name, value in constants.items() if name != "delta_beta"}
+    """`scan` with the optics that `constants` say, in the pixels it has; δ and β hold at their energy then.
+
+    A detector's blur is in the pixels of the scan, and the source's, its angle times the distance, joins it.
+    """
+    changes = {name: np.full(len(scan), value) for name, value in constants.items() if name in FIELDS}
+    if "source_angle" in constants:
+        exposures = replace(scan.exposures, **changes)
+        blur = constants["source_angle"] * np.abs(exposures.distance)
+        changes["psf_sigma_px"] = joined_blur_px(exposures.psf_sigma_px, blur, exposures.views.pixel_sizes)
     if not changes:
         return scan
     reference = None if "energy_kev" in changes else scan.exposures.reference_kev

@@ -43,8 +43,11 @@ ENOUGH_AIR = 0.1
 
 Range = tuple[float, float]
 
-UNITS = {"distance": " m", "energy_kev": " keV", "delta_beta": ""}
-CALLED = {"distance": "distance", "energy_kev": "energy", "delta_beta": "δ/β"}
+UNITS = {"distance": " m", "energy_kev": " keV", "source_angle": " rad", "psf_sigma_px": " pixels"}
+CALLED = {"energy_kev": "energy", "delta_beta": "δ/β", "source_angle": "source over its distance"}
+CALLED |= {"psf_sigma_px": "blur of the detector", "distance": "distance", "bandwidth": "bandwidth"}
+WIDTHS = ("bandwidth", "source_angle", "psf_sigma_px")
+"""Constants that may be 0, which holds unless the frames predict each other better with the likeliest value."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +61,12 @@ class Uncertain:
     """Photon energy [keV], the same for all frames."""
     delta_beta: Range | None = None
     """δ/β of the one material, at the nominal energy."""
+    bandwidth: Range | None = None
+    """Relative full width at half maximum of the spectrum, the same for all frames."""
+    source_angle: Range | None = None
+    """Standard deviation of the source over its distance from the sample [rad]."""
+    psf_sigma_px: Range | None = None
+    """Standard deviation of the detector's blur [pixels]."""
 
     def __post_init__(self) -> None:
         for name, (low, high) in self.given().items():
@@ -91,7 +100,7 @@ class Determined:
 
     def line(self) -> str:
         """The same in words."""
-        unit, (least, most) = UNITS[self.name], self.given
+        unit, (least, most) = UNITS.get(self.name, ""), self.given
         known = f"{self.low:.4g} to {self.high:.4g}{unit}"
         said = f"by the frames, {known}" if self.told else "the frames say no more than the range"
         said += f"; given: {least:.4g} to {most:.4g}{unit}"
@@ -127,7 +136,21 @@ def determine(task: Task, uncertain: Uncertain, options: ProfileOptions | None =
     profile = Profile(task, ratio, middle | {"delta_beta": ratio}, corners, options or ProfileOptions())
     if profile.air() < ENOUGH_AIR:
         return _untold(ranges, middle, "too few pixels show empty space, without which frames cannot tell")
-    return Search(profile, ranges, task, start).run()
+    return without_idle(profile, Search(profile, ranges, task, start).run())
+
+
+def without_idle(profile: Profile, found: tuple[Determined, ...]) -> tuple[Determined, ...]:
+    """`found` with 0 for each width that the frames do not need, all others as they were found."""
+    for i, each in enumerate(found):
+        if each.name not in WIDTHS:
+            continue
+        values = {one.name: one.value for one in found}
+        chosen = profile.needs(each.name, values) if each.told else None
+        if chosen is None or chosen.choice != each.name:
+            remark = "0 is used" if chosen is None else f"{chosen.line}; 0 is used"
+            none = replace(each, value=0.0, low=0.0, told=False, remark=remark)
+            found = (*found[:i], none, *found[i + 1 :])
+    return found
 
 
 def likeliest_ratio(task: Task, options: ProfileOptions | None = None) -> Determined:
@@ -139,7 +162,10 @@ def likeliest_ratio(task: Task, options: ProfileOptions | None = None) -> Determ
 
 
 def _untold(ranges: Mapping[str, Range], middle: Mapping[str, float], why: str) -> tuple[Determined, ...]:
-    return tuple(Determined(name, middle[name], *_sorted(r), r, False, why) for name, r in ranges.items())
+    return tuple(
+        Determined(name, 0.0 if name in WIDTHS else middle[name], *_sorted(r), r, False, why)
+        for name, r in ranges.items()
+    )
 
 
 def told(task: Task, found: tuple[Determined, ...]) -> Task:

@@ -13,7 +13,15 @@ from ..checks import require
 from ..geometry import Poses
 from ..scan import Exposures
 
-WIDTHS: dict[str, tuple[int, ...]] = {"turns": (3,), "shifts": (2,), "stretches": (), "blurs": (), "magnified": ()}
+WIDTHS: dict[str, tuple[int, ...]] = {
+    "turns": (3,),
+    "shifts": (2,),
+    "stretches": (),
+    "blurs": (),
+    "magnified": (),
+    "energies": (),
+    "bandwidths": (),
+}
 """The corrections by name, and how many numbers each view has of them."""
 
 
@@ -26,6 +34,8 @@ class Alignment:
     stretches: [V] changes ε of the propagation distance, as a share of it: `z' = z (1 + ε)`
     blurs: [V] changes b of the width of the point-spread function [pixels]: `σ' = |σ + b|`
     magnified: [V] changes m of the magnification, as a share of it: the pixel in the sample's plane is `p / (1 + m)`
+    energies: [V] changes e of the photon energy, as a share of it: `E' = E (1 + e)`
+    bandwidths: [V] changes b of the relative bandwidth: `ΔE/E' = |ΔE/E + b|`
 
     The signs are those of `beamline.misalignment`. Errors: `InputError` for shapes that do not fit together.
     """
@@ -35,6 +45,8 @@ class Alignment:
     stretches: Tensor | None = None
     blurs: Tensor | None = None
     magnified: Tensor | None = None
+    energies: Tensor | None = None
+    bandwidths: Tensor | None = None
 
     def __post_init__(self) -> None:
         shapes = {name: tuple(p.shape) for name, p in self.parameters().items()}
@@ -107,17 +119,33 @@ class Alignment:
         blurs = _picked(self.blurs, index)
         return (_picked(torch.from_numpy(planned.psf_sigma_px).to(blurs), index) + blurs).abs()
 
+    def light(self, planned: Exposures, index: Tensor | None = None) -> tuple[Tensor | None, Tensor | None] | None:
+        """Energies [K] over the planned ones, and bandwidths [K], float64, as `Instrument.frames` takes them.
+
+        None: as planned."""
+        if self.energies is None and self.bandwidths is None:
+            return None
+        widths = None
+        if self.bandwidths is not None:
+            changes = _picked(self.bandwidths, index)
+            widths = (_picked(torch.from_numpy(planned.bandwidth).to(changes), index) + changes).abs()
+        return None if self.energies is None else 1 + _picked(self.energies, index), widths
+
     def exposures(self, planned: Exposures) -> Exposures:
         """The `planned` exposures, corrected."""
         on = next((p.device for p in self.parameters().values()), "cpu")
         with torch.no_grad():
             poses = self.poses(Poses.of(planned.views, on), planned.views.pitch)
             distance, sigma = self.distance(planned), self.psf_sigma_px(planned)
+            energy, bandwidth = self.light(planned) or (None, None)
         return replace(
             planned,
             views=poses.views(),
             distance=planned.distance if distance is None else distance.cpu().numpy(),
             psf_sigma_px=planned.psf_sigma_px if sigma is None else sigma.cpu().numpy(),
+            energy_kev=planned.energy_kev if energy is None else planned.energy_kev * energy.cpu().numpy(),
+            reference_kev=planned.reference_kev if energy is None else planned.reference_energy,
+            bandwidth=planned.bandwidth if bandwidth is None else bandwidth.cpu().numpy(),
         )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -12,6 +13,7 @@ from torch import Tensor
 from ..backends import device, resolve
 from ..checks import require
 from ..geometry import Poses
+from ..optics.coherence import quadrature
 from ..optics.hologram import OpticalPath, Refraction, hologram, optical_path
 from ..optics.sampling import padding
 from ..scan import Exposures, far_from_edges
@@ -21,8 +23,23 @@ from ..volume import LineIntegrals
 MOST_SAMPLES = 1_000_000_000
 """Samples of all waves held at once, at most (16 GB as complex128)."""
 
+Light = tuple[Tensor | None, Tensor | None]
+"""Energies over the planned ones [V], and bandwidths [V], float64; None: as planned."""
+
 MOST_CHANNELS = 2
 """Channels of matter that the kernels of the waves take; more are summed to δ and β first."""
+
+
+@dataclass(frozen=True)
+class _Colour:
+    """One energy of the light: its node of the quadrature and weight, the frames' energies [V] [keV], their waves, and
+    k times the dispersion of matter."""
+
+    node: float
+    weight: float
+    energies: np.ndarray
+    path: OpticalPath
+    factors: np.ndarray | Tensor
 
 
 class Instrument:
@@ -34,6 +51,8 @@ class Instrument:
     `dispersion`: factors [V, 2], or of each channel of matter [V, C, 2], of δ and β at the frames' energies over those
     at the reference energy (`materials.dispersion`; default: `scan.far_from_edges`, 1 where all energies are one).
     `on`: the device (default: that of the backend; `reference` computes on any).
+    Frames of light with a bandwidth are the incoherent sum over a few energies (`optics.coherence.quadrature`), with
+    `δ ∝ E⁻²`, `β ∝ E⁻⁴` within it; frames of one energy cost what they did.
     """
 
     def __init__(
@@ -61,9 +80,10 @@ class Instrument:
             "use fewer or smaller frames.",
         )
         ratio = far_from_edges(exposures.energy_kev, exposures.reference_energy) if dispersion is None else dispersion
-        self._factors = _factors(wavenumber(exposures.energy_kev), ratio, self.device)
         one = None if self.views.has_one_pixel else False  # scaled distances are those of Fresnel's kernel alone
-        self.path = self._path(None, None, None, one)
+        self._colours = [self._colour(*each, ratio, one) for each in zip(*quadrature(exposures))]
+        self.path = self._colours[len(self._colours) // 2].path
+        """The waves' path at the energy nearest to the middle of the spectrum."""
 
     @cached_property
     def poses(self) -> Poses:
@@ -86,46 +106,89 @@ class Instrument:
         index: np.ndarray | Tensor | None = None,
         distance: Tensor | None = None,
         psf_sigma_px: Tensor | None = None,
+        light: Light | None = None,
     ) -> Tensor:
         """Frames [V, H, W] from line integrals on `self.views` (or its views `index`), in the instrument's type.
 
         distance, psf_sigma_px: other distances [V] [m], on pixels of the views' pitch (`Exposures.optical`), and
         point-spread functions [V] [pixels] than those of the exposures, float64, with gradients if they require them.
+        light: likewise, energies over the planned ones [V], and bandwidths [V]. A spectrum has as many energies as the
+        planned bandwidth needs, so that a fit of bandwidths starts from one above 0; else `InputError`.
         """
         if len(lines.materials) > MOST_CHANNELS:
             lines = LineIntegrals.of(*lines)
         chosen = None if index is None else torch.as_tensor(index, device=self.device)
-        if distance is None and psf_sigma_px is None:
-            path = self.path if chosen is None else self.path[chosen]
+        parts = [self._of_one(colour, lines, chosen, distance, psf_sigma_px, light) for colour in self._colours]
+        if len(parts) == 1:
+            return parts[0]
+        return sum((colour.weight * part for colour, part in zip(self._colours, parts)), torch.zeros_like(parts[0]))
+
+    def _of_one(
+        self,
+        colour: _Colour,
+        lines: LineIntegrals,
+        chosen: Tensor | None,
+        distance: Tensor | None,
+        psf_sigma_px: Tensor | None,
+        light: Light | None,
+    ) -> Tensor:
+        """Frames [V, H, W] of one energy of the light."""
+        channels = lines.channels.to(self.device, self.dtype)
+        if light is not None:
+            one = not isinstance(colour.factors, Tensor) or colour.factors.shape[1] == 1
+            require(one, "an energy or bandwidth that is fitted needs matter of one dispersion, but it has several.")
+            ratio = self._relative(colour, chosen, light)
+            lines = LineIntegrals.of(*lines)
+            scale = torch.stack((1 / ratio, ratio**-3), dim=1).to(self.dtype)  # of kδ and kβ
+            channels = lines.channels.to(self.device, self.dtype) * scale[:, :, None, None]
+            planned = self._optical.distance if chosen is None else self._optical.distance[chosen.cpu().numpy()]
+            distance = (torch.from_numpy(planned).to(ratio) if distance is None else distance) / ratio
+        if distance is None:
+            path = colour.path if chosen is None else colour.path[chosen]
+            path = path if psf_sigma_px is None else path.corrected(psf_sigma=psf_sigma_px * self.oversample)
         else:
-            path = self._path(chosen, distance, psf_sigma_px, self.path.beyond is not None)
-        refraction = self.refraction(lines.materials, chosen)
-        return hologram(lines.channels.to(self.device, self.dtype), refraction, path, self.backend)
+            path = self._path(colour.energies, chosen, distance, psf_sigma_px, self.path.beyond is not None)
+        return hologram(channels, _refraction(colour.factors, lines.materials, chosen), path, self.backend)
+
+    def _relative(self, colour: _Colour, chosen: Tensor | None, light: Light) -> Tensor:
+        """Energies [V] of `light` over those of the `colour`."""
+        energy, bandwidth = light
+        alone = len(self._colours) == 1 and bandwidth is not None
+        require(not alone, "a fit of the bandwidth needs a planned one above 0, but it is 0; give one (--bandwidth).")
+        planned = torch.from_numpy(self.exposures.bandwidth).to(self.device)
+        planned = planned if chosen is None else planned.index_select(0, chosen)
+        width = planned if bandwidth is None else bandwidth
+        ratio = (1 + colour.node * width) / (1 + colour.node * planned)
+        return ratio if energy is None else ratio * energy
 
     def refraction(self, materials: Sequence[tuple[float, float]], index: Tensor | None = None) -> Refraction:
-        """`(k δ, k β)` of each channel as `hologram` takes them: [C, 2], or [K, C, 2] where they differ between views.
+        """`(k δ, k β)` of each channel as `hologram` takes them, at `path`'s energy: see `_refraction`."""
+        return _refraction(self._colours[len(self._colours) // 2].factors, materials, index)
 
-        materials: (δ, β) of each channel at the reference energy; index: views [K] on the instrument's device.
-        """
-        channels = [min(c, self._factors.shape[1] - 1) for c in range(len(materials))]
-        if isinstance(self._factors, np.ndarray):
-            return [(f[0] * m[0], f[1] * m[1]) for f, m in zip(self._factors[0, channels].tolist(), materials)]
-        factors = self._factors if index is None else self._factors.index_select(0, index)
-        pairs = [factors[:, c].unbind(1) for c in channels]
-        return torch.stack([torch.stack((f * d, g * b), dim=1) for (f, g), (d, b) in zip(pairs, materials)], dim=1)
+    def _colour(self, node: float, weight: float, dispersion: np.ndarray, exact: bool | None) -> _Colour:
+        shift = 1 + node * self._optical.bandwidth
+        energies = self._optical.energy_kev * shift
+        within = np.stack((shift**-2, shift**-4), axis=-1).reshape(-1, 1, 2)
+        factors = _factors(wavenumber(energies), dispersion.reshape(len(shift), -1, 2) * within, self.device)
+        return _Colour(node, weight, energies, self._path(energies, None, None, None, exact), factors)
 
     def _path(
-        self, index: Tensor | None, distance: Tensor | None, psf_sigma_px: Tensor | None, exact: bool | None
+        self,
+        energies: np.ndarray,
+        index: Tensor | None,
+        distance: Tensor | None,
+        psf_sigma_px: Tensor | None,
+        exact: bool | None,
     ) -> OpticalPath:
-        """The path of the views `index` at other distances, or through other point-spread functions; exact: as of
-        `optical_path`."""
+        """The path of the views `index` at `energies` of all views [V] [keV], at other distances, or through other
+        point-spread functions; exact: as of `optical_path`."""
         taken = self._optical if index is None else self._optical[index.cpu().numpy()]
         my, mx = (m * self.oversample for m in self.margin)
         sigma = taken.psf_sigma_px if psf_sigma_px is None else psf_sigma_px
         return optical_path(
             self.views.shape,
             self.views.pitch,
-            taken.energy_kev,
+            energies if index is None else energies[index.cpu().numpy()],
             taken.distance if distance is None else distance,
             sigma * self.oversample,
             (taken.views.shape, (my, mx), self.oversample),
@@ -136,6 +199,22 @@ class Instrument:
     def image(self, B: Tensor, D: Tensor, index: np.ndarray | None = None) -> Tensor:
         """Frames [V, H, W] from line integrals B, D [V, H', W'] in metres on `self.views` (or its views `index`)."""
         return self.frames(LineIntegrals.of(B, D), index)
+
+
+def _refraction(
+    factors: np.ndarray | Tensor, materials: Sequence[tuple[float, float]], index: Tensor | None
+) -> Refraction:
+    """`(k δ, k β)` of each channel as `hologram` takes them: [C, 2], or [K, C, 2] where they differ between views.
+
+    factors: as of `_factors`; materials: (δ, β) of each channel at the reference energy; index: views [K] on the
+    instrument's device.
+    """
+    channels = [min(c, factors.shape[1] - 1) for c in range(len(materials))]
+    if isinstance(factors, np.ndarray):
+        return [(f[0] * m[0], f[1] * m[1]) for f, m in zip(factors[0, channels].tolist(), materials)]
+    factors = factors if index is None else factors.index_select(0, index)
+    pairs = [factors[:, c].unbind(1) for c in channels]
+    return torch.stack([torch.stack((f * d, g * b), dim=1) for (f, g), (d, b) in zip(pairs, materials)], dim=1)
 
 
 def _factors(wavenumbers: np.ndarray, dispersion: np.ndarray, device: torch.device) -> np.ndarray | Tensor:

@@ -146,7 +146,9 @@ class Model:
     def capturable(self) -> bool:
         """Whether frames are made on the device alone: those of one time, at the planned distances and blurs."""
         alignment = self.alignment
-        planned = alignment is None or not (alignment.moves_waves or alignment.blurs is not None)
+        optics = ("blurs", "energies", "bandwidths")
+        moved = alignment is not None and any(getattr(alignment, name) is not None for name in optics)
+        planned = alignment is None or not (alignment.moves_waves or moved)
         return planned and len(self.instrument.times) == 1
 
     def parameters(self) -> dict[str, Tensor]:
@@ -229,7 +231,7 @@ def frames_of(matter: Object, model: Model, index: Tensor | None) -> Tensor:
     if alignment is None:
         return model.instrument.frames(lines, index)
     distance, sigma = alignment.optical_distance(planned, index), alignment.psf_sigma_px(planned, index)
-    return model.instrument.frames(lines, index, distance, sigma)
+    return model.instrument.frames(lines, index, distance, sigma, alignment.light(planned, index))
 
 
 def measure(obj: Object, exposures: Exposures, oversample: int = 1, dtype: torch.dtype = torch.float32) -> Tensor:

@@ -8,13 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..checks import finite, in_range, require, shaped
-from ..scan import DISTANCE_RANGE_M, ENERGY_RANGE_KEV, PIXEL_RANGE_M
+from ..scan import DISTANCE_RANGE_M, ENERGY_RANGE_KEV, MOST_BANDWIDTH, PIXEL_RANGE_M, Exposures
+from ..units import wavelength
 
 SOURCE_RANGE_M = (1e-9, 1e-1)
 SOURCE_DISTANCE_RANGE_M = (1e-6, 1e5)
-MOST_BANDWIDTH = 0.5
 FWHM = 2 * math.sqrt(2 * math.log(2))
 """Full width at half maximum of a Gaussian of standard deviation 1."""
+QUADRATURE = 1e-3
+"""Error of the contrast of the finest fringes, as a share of it, that a sum over energies may have."""
+MOST_ENERGIES = 32
+"""Energies of a spectrum in a fit at most: each costs the waves of a frame."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +65,31 @@ class Spectrum:
         return len(self.weights)
 
 
+def quadrature(exposures: Exposures) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes [E] and weights [E] of a sum over the energies `E₀ (1 + node · bandwidth)` of the light of all frames.
+
+    Of Gauss–Hermite quadrature (Abramowitz & Stegun 1964, eq. 25.4.46), as few as err by `QUADRATURE` at most. Fringes
+    of the frequency f vary with the energy as cos(χE₀/E), χ = πλz f². Over a Gaussian of relative standard deviation σ
+    the remainder of n nodes is `(χσ)²ⁿ n!/(2n)!` at most, χ that of the corner of the detector's spectrum. One node of
+    weight 1 where all frames have one energy. Errors: `InputError` where more than `MOST_ENERGIES` would be needed.
+    """
+    optics = exposures.optical
+    reach = wavelength(optics.energy_kev) * np.abs(optics.distance)
+    worst = float(np.max(math.pi * reach / (2 * optics.views.pitch**2) * optics.bandwidth / FWHM, initial=0.0))
+    count, error = 1, worst**2 / 2
+    while error > QUADRATURE and count <= MOST_ENERGIES:
+        count += 1
+        error *= worst**2 / (2 * (2 * count - 1))
+    least = 1 - math.sqrt(4 * count + 2) * float(np.max(optics.bandwidth, initial=0.0)) / FWHM
+    require(
+        count <= MOST_ENERGIES and least > 0,
+        f"a bandwidth of {float(np.max(optics.bandwidth)):g} washes out the finest fringes of these pixels and "
+        f"distances, which takes more than {MOST_ENERGIES} energies, or such below 0; bin the frames (--bin).",
+    )
+    nodes, weights = np.polynomial.hermite.hermgauss(count)
+    return math.sqrt(2) / FWHM * nodes, weights / weights.sum()
+
+
 def source_blur(source_size: float, source_distance: float, distance: float | np.ndarray) -> np.ndarray:
     """Standard deviation [m], in the sample plane, of the blur by a Gaussian source.
 
@@ -75,7 +104,9 @@ def source_blur(source_size: float, source_distance: float, distance: float | np
     return size * np.asarray(distance, dtype=np.float64) / z1
 
 
-def joined_blur_px(psf_sigma_px: float | np.ndarray, blur: float | np.ndarray, pixel_size: float) -> np.ndarray:
+def joined_blur_px(
+    psf_sigma_px: float | np.ndarray, blur: float | np.ndarray, pixel_size: float | np.ndarray
+) -> np.ndarray:
     """Standard deviation [pixels] of the point-spread function and another Gaussian `blur` [m] together."""
     return np.hypot(psf_sigma_px, np.asarray(blur) / pixel_size)
 

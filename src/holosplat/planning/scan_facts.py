@@ -191,6 +191,8 @@ def _beam(exposures: Exposures, unsaid: Unsaid) -> dict[str, str]:
     rows |= {NAMES.get(name, name): UNKNOWN if name in unsaid else text for name, text in values.items()}
     if exposures.psf_sigma_px.any():
         rows["blur"] = f"standard deviation {span(exposures.psf_sigma_px)} pixels"
+    if exposures.bandwidth.any():
+        rows["bandwidth"] = f"{span(exposures.bandwidth)} of the energy, full width at half maximum"
     return rows
 
 

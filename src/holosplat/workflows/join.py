@@ -159,10 +159,11 @@ def _exposures(
         shape,
         pixel_size,
     )
-    energy, distance, time = (
-        np.concatenate([getattr(part, name) for part in parts]) for name in ("energy_kev", "distance", "time")
+    energy, distance, time, bandwidth = (
+        np.concatenate([getattr(part, name) for part in parts])
+        for name in ("energy_kev", "distance", "time", "bandwidth")
     )
-    return Exposures(views, energy, distance, blurs, time)
+    return Exposures(views, energy, distance, blurs, time, bandwidth=bandwidth)
 
 
 def _shared(texts: list[dict[str, str]]) -> dict[str, str]:

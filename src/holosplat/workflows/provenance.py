@@ -41,6 +41,8 @@ def scan_hash(scan: Scan) -> str:
     views = scan.views
     pixels = views.pixel_size if views.has_one_pixel else views.pixel_sizes.tolist()
     digest.update(repr((pixels, _energies(exposures))).encode())
+    if np.any(exposures.bandwidth):
+        digest.update(np.ascontiguousarray(exposures.bandwidth).tobytes())
     return digest.hexdigest()[:16]
 
 

@@ -233,13 +233,16 @@ EXPECTED = {
     "alignment.shifts": 1.0,
     "alignment.stretches": 0.02,
     "alignment.blurs": 0.5,
+    "alignment.energies": 0.01,
+    "alignment.bandwidths": 0.01,
     "light.coefficients": 0.02,
 }
-"""Standard deviations where nobody says otherwise: [rad], [pixels], share of the distance, [pixels], share of light."""
+"""Standard deviations where nobody says otherwise: [rad], [pixels], share of the distance, [pixels], shares of
+the energy (twice), share of light."""
 
 
 def alignment_prior(weight: float, model: Model, train: Scan) -> Term:
-    """Poses, distances and blurs near to the plan; `InputError` for a model without alignment."""
+    """Poses, distances, blurs, energies and bandwidths near to the plan; `InputError` for a model without alignment."""
     return _quadratic("alignment_prior", "alignment.", weight, model.parameters())
 
 
