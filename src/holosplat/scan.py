@@ -18,6 +18,8 @@ from .units import BEAM_RANGE_KEV
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from .volume import Wall
+
 ENERGY_RANGE_KEV = (0.1, 1000.0)
 PIXEL_RANGE_M = (1e-10, 1e-2)
 DISTANCE_RANGE_M = (1e-9, 1e4)
@@ -35,6 +37,7 @@ class Exposures:
     psf_sigma_px: [N] standard deviations of the Gaussian point-spread function [detector pixels].
     time: [N] seconds since the first frame.
     reference_kev: the energy [keV] for which δ and β of matter are given (None: the energy of the first frame).
+    wall: what is known to be in the beam beside the object, and is part of every model of the frames (None: nothing).
 
     A number stands for N equal ones. Errors: `InputError` for numbers out of range.
 
@@ -56,6 +59,7 @@ class Exposures:
     psf_sigma_px: np.ndarray
     time: np.ndarray
     reference_kev: float | None = None
+    wall: Wall | None = None
 
     def __post_init__(self) -> None:
         count = len(self.views)
@@ -264,6 +268,12 @@ class Scan:
     def taken(self, exposures: Exposures) -> Scan:
         """The same frames with other exposures."""
         return Scan.of(self.source, exposures, self.is_test, self.provenance, self.light, self._missing)
+
+    def beside(self, wall: Wall, said: str = "told") -> Scan:
+        """The same frames of an object in a known wall; said: what its provenance says of that."""
+        facts = self.provenance | {"wall": said}
+        exposures = replace(self.exposures, wall=wall)
+        return Scan.of(self.source, exposures, self.is_test, facts, self.light, self._missing)
 
     def __len__(self) -> int:
         return len(self.source)

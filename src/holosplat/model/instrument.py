@@ -13,7 +13,8 @@ from ..backends import device, resolve
 from ..checks import require
 from ..geometry import Poses
 from ..optics.hologram import OpticalPath, Refraction, hologram, optical_path
-from ..optics.sampling import padding
+from ..optics.retrieval.contact import beside_faces
+from ..optics.sampling import is_steep, padding
 from ..scan import Exposures, far_from_edges
 from ..units import wavenumber
 from ..volume import LineIntegrals
@@ -64,6 +65,14 @@ class Instrument:
         self._factors = _factors(wavenumber(exposures.energy_kev), ratio, self.device)
         one = None if self.views.has_one_pixel else False  # scaled distances are those of Fresnel's kernel alone
         self.path = self._path(None, None, None, one)
+        wall, units = exposures.wall, (wavenumber(exposures.energy_kev)[:, None, None] * ratio.reshape(len(exposures), -1, 2))
+        known = None if wall is None else wall.behind(self.views, units[:, -1, 1], units[:, -1, 0])
+        self._wall = None if known is None else known.to(self.device, dtype)
+        """Line integrals [2, V, H or 1, W] of β and δ of what is known beside the object; None for nothing."""
+        self._more: Tensor | None = None
+        if is_steep(exposures):
+            nothing = torch.zeros((2, len(self.views), *self.views.shape), dtype=dtype)
+            self._more = beside_faces(exposures, self.frames(LineIntegrals.of(*nothing)))
 
     @cached_property
     def poses(self) -> Poses:
@@ -92,15 +101,19 @@ class Instrument:
         distance, psf_sigma_px: other distances [V] [m], on pixels of the views' pitch (`Exposures.optical`), and
         point-spread functions [V] [pixels] than those of the exposures, float64, with gradients if they require them.
         """
+        chosen = None if index is None else torch.as_tensor(index, device=self.device)
+        if self._wall is not None:
+            known = self._wall if chosen is None else self._wall[:, chosen]
+            lines = LineIntegrals.of(*(known + torch.stack((lines[0], lines[1])).to(known)))
         if len(lines.materials) > MOST_CHANNELS:
             lines = LineIntegrals.of(*lines)
-        chosen = None if index is None else torch.as_tensor(index, device=self.device)
         if distance is None and psf_sigma_px is None:
             path = self.path if chosen is None else self.path[chosen]
         else:
             path = self._path(chosen, distance, psf_sigma_px, self.path.beyond is not None)
         refraction = self.refraction(lines.materials, chosen)
-        return hologram(lines.channels.to(self.device, self.dtype), refraction, path, self.backend)
+        found = hologram(lines.channels.to(self.device, self.dtype), refraction, path, self.backend)
+        return found if self._more is None else found + (self._more if chosen is None else self._more[chosen])
 
     def refraction(self, materials: Sequence[tuple[float, float]], index: Tensor | None = None) -> Refraction:
         """`(k δ, k β)` of each channel as `hologram` takes them: [C, 2], or [K, C, 2] where they differ between views.
