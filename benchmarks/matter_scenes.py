@@ -40,9 +40,9 @@ from holosplat.geometry import Grid, Views
 from holosplat.methods import Auto, PerView
 from holosplat.metrics import dice, volume_scores
 from holosplat.scan import Exposures, Scan
+from holosplat.specimens import MeshScene
 from holosplat.specimens.drawn import Drawn, Substances
 from holosplat.specimens.fluids import Cuvette
-from holosplat.specimens import MeshScene
 from holosplat.specimens.matter import MATTER, FieldMatter
 from holosplat.specimens.solids import Channel
 from holosplat.volume import Volume, Wall
@@ -105,7 +105,6 @@ class Scene:
             return hs.MaterialPrior.known(first, core.against(self.substances.medium))
         return hs.MaterialPrior.known(first)
 
-
     @property
     def within(self) -> tuple[str, hs.DeltaBeta]:
         """What is in the filling of the wall: the name of its region, and δ and β against the filling."""
@@ -155,7 +154,9 @@ def run(name: str, size: str, how: str, seed: int, made: Scene) -> Row:
         assert isinstance(made.kind, Cuvette | Channel)
         scan = scan.beside(wall_of(made.kind, made.substances))
         region, matter = made.within
-        drawn = Drawn(MeshScene.of_one_material(drawn.regions[region].meshes, matter), drawn.text)
+        bodies = drawn.regions[region]
+        assert isinstance(bodies, MeshScene)
+        drawn = Drawn(MeshScene.of_one_material(bodies.meshes, matter), drawn.text)
     try:
         done = hs.reconstruct(scan, made.told(how), TEXTBOOK if how == "Paganin, TV" else Auto())
         found, result = done.object.voxelise(grid), done.object.kind

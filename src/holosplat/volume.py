@@ -1,4 +1,4 @@
-"""Matter: the `Volume` on a grid, the `Object` protocol that every model of matter answers, and walls that are known."""
+"""Matter: the `Volume` on a grid, the `Object` protocol that every model of matter answers, and known walls."""
 
 from __future__ import annotations
 
@@ -208,8 +208,10 @@ class Wall:
         return B, D
 
     def behind(self, views: Views, absorbing: np.ndarray, refracting: np.ndarray) -> torch.Tensor:
-        """Line integrals (B, D) [2, V, H or 1, W] float64 [m] of the mean wave in each pixel (`mean_wave`), where H is 1
-        if all rows are alike."""
+        """Line integrals (B, D) [2, V, H or 1, W] float64 [m] of the mean wave in each pixel (`mean_wave`).
+
+        H is 1 if all rows are alike.
+        """
         import torch
 
         parts = np.stack([self._lines(views, n, WAVES) for n in range(WAVES)], axis=-1)

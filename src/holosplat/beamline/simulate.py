@@ -29,7 +29,7 @@ from ..specimens.mesh_series import MeshSeries
 from ..specimens.repair import closed
 from ..specimens.scene import MeshScene
 from ..units import LENGTH_UNITS, unit_factor, wavenumber
-from ..volume import Object, Volume, mean_wave
+from ..volume import LineIntegrals, Object, Volume, mean_wave
 from .light import EVEN_LIGHT, UnevenLight
 
 SIMULATED_FRINGE_SAMPLES = 8
@@ -151,7 +151,7 @@ class _Sharp:
         jumps = [refracted.diff(dim=axis).abs().amax() for axis in (1, 2) if refracted.shape[axis] > 1]
         if not jumps or float(max(jumps)) * float((k * delta).max()) <= np.pi:
             return absorbed, refracted
-        fine = torch.stack(list(self.obj.project(views.refined(FINER))))
+        fine = torch.stack(tuple(LineIntegrals.of_any(self.obj.project(views.refined(FINER)))[n] for n in (0, 1)))
         parts = fine.unflatten(3, (-1, FINER)).unflatten(2, (-1, FINER)).movedim(3, 4).flatten(4)
         B, D = mean_wave(parts, k * beta, k * delta)
         return B, D

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -231,7 +232,9 @@ class Reading:
             scan = stitched(scan)
         tell_views(scan)
         scan = scan if self.told.tube is None else Tube.parsed(self.told.tube).taken_out_of(scan)
-        return self.part.of(scan if self.told.wall is None else scan.beside(wall_of(self.told.wall, scan), self.told.wall))
+        return self.part.of(
+            scan if self.told.wall is None else scan.beside(wall_of(self.told.wall, scan), self.told.wall)
+        )
 
     def as_table(self) -> dict[str, Any]:
         """What differs from the default, by field, ready for JSON; paths are absolute. `time_frame` is not there."""
@@ -362,7 +365,7 @@ def wall_of(text: str, scan: Scan) -> Wall:
     place = [number_in(word) for word in words[count + 2 :]]
     good = count and len(words) - count in (1, 2, 5) and all(len(each) <= 2 - (kind == "tube") for each in sections)
     require(
-        bool(good) and all(map(math.isfinite, [*sum(sections, []), *place])),
+        bool(good) and all(map(math.isfinite, [*chain(*sections), *place])),
         "--wall must be tube:INNER:OUTER:MATERIAL:FILLING, cuvette:INNER:OUTER:MATERIAL:FILLING or "
         f"slab:INNER:MATERIAL:FILLING, with :X:Z:TURN behind that or not, but it is {shown(text)}; write, for "
         "instance, tube:4e-5:5e-5:glass:water.",

@@ -14,7 +14,7 @@ from ..checks import require
 from ..geometry import Poses
 from ..optics.hologram import OpticalPath, Refraction, hologram, optical_path
 from ..optics.retrieval.contact import beside_faces
-from ..optics.sampling import is_steep, padding
+from ..optics.sampling import padding
 from ..scan import Exposures, far_from_edges
 from ..units import wavenumber
 from ..volume import LineIntegrals
@@ -65,12 +65,15 @@ class Instrument:
         self._factors = _factors(wavenumber(exposures.energy_kev), ratio, self.device)
         one = None if self.views.has_one_pixel else False  # scaled distances are those of Fresnel's kernel alone
         self.path = self._path(None, None, None, one)
-        wall, units = exposures.wall, (wavenumber(exposures.energy_kev)[:, None, None] * ratio.reshape(len(exposures), -1, 2))
+        wall, units = (
+            exposures.wall,
+            (wavenumber(exposures.energy_kev)[:, None, None] * ratio.reshape(len(exposures), -1, 2)),
+        )
         known = None if wall is None else wall.behind(self.views, units[:, -1, 1], units[:, -1, 0])
         self._wall = None if known is None else known.to(self.device, dtype)
         """Line integrals [2, V, H or 1, W] of β and δ of what is known beside the object; None for nothing."""
         self._more: Tensor | None = None
-        if is_steep(exposures):
+        if wall is not None:
             nothing = torch.zeros((2, len(self.views), *self.views.shape), dtype=dtype)
             self._more = beside_faces(exposures, self.frames(LineIntegrals.of(*nothing)))
 

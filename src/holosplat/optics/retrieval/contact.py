@@ -22,7 +22,7 @@ from ...scan import Exposures
 from ...units import wavenumber
 from ..hologram import hologram, optical_path
 from ..noise import noise_levels, with_gaps
-from ..sampling import SharedPoses, alike, fringe_sampling, is_steep, padding
+from ..sampling import SharedPoses, alike, fringe_sampling, padding
 from .spectra import checked, column, finest_phase
 
 UNSEEN = 0.01
@@ -91,12 +91,12 @@ ROUNDS = 3
 """How often the frames beside a wall are made anew for a retrieval: first with no matter, then with what was found."""
 
 
-def seen(exposures: Exposures, thickness: Tensor, material: tuple[float, float], finer: int = 1) -> Tensor:
+def seen(exposures: Exposures, thickness: Tensor, material: tuple[float, float], s: int) -> Tensor:
     """Frames [V, H, W] of a thickness [V, H, W] [m] of `material` (δ, β), which goes on beyond as at the edge, and of
-    the wall of the exposures, if any; finer: times as many samples as fits have."""
+    the wall of the exposures, if any; s: wave samples along a pixel's edge."""
     found = torch.empty_like(thickness)
-    for index in alike(exposures):
-        part, s = exposures[index], finer * fringe_sampling(exposures[index])
+    for index in alike(exposures, s):
+        part = exposures[index]
         (my, mx), optical = padding(part, s), part.optical
         wide = pad(thickness[index][:, None], (mx, mx, my, my), mode="replicate")
         fine = interpolate(wide, scale_factor=s, mode="bilinear", align_corners=False)[:, 0]
@@ -108,19 +108,24 @@ def seen(exposures: Exposures, thickness: Tensor, material: tuple[float, float],
         B, D = (line * column(unit).to(fine) for line, unit in zip(lines, units))
         frame = (part.views.shape, (my * s, mx * s), s)
         blurs, pitch = optical.psf_sigma_px * s, optical.views.pitch / s
-        path = optical_path(fine.shape[1:], pitch, part.energy_kev, optical.distance, blurs, frame, fine.dtype)
+        path = optical_path(
+            (fine.shape[1], fine.shape[2]), pitch, part.energy_kev, optical.distance, blurs, frame, fine.dtype
+        )
         found[index] = hologram(torch.stack((D, B), 1), [(1.0, 0.0), (0.0, 1.0)], path, "reference")
     return found
 
 
 def beside_faces(exposures: Exposures, few: Tensor) -> Tensor:
-    """What frames `few` [V, H, W] of a wall alone lack, [V, H, W]: those of `FINEST` times the samples of fits less them.
+    """What frames `few` [V, H, W] of a wall alone lack, [V, H, W]: those of `FINEST` times finer samples less them.
 
     At flat faces along the beam waves have no end of high frequencies, and samples that hold those of what is inside
     lack them; what they miss of the wall's own frame is the most of it.
     """
-    nothing = few.new_zeros(few.shape, device="cpu")
-    return seen(exposures, nothing, (1.0, 0.0), FINEST).to(few) - few
+    views = exposures.views
+    rows = 1 if views.shares_axis else views.shape[0]
+    exposures = replace(exposures, views=replace(views, shape=(rows, views.shape[1])))
+    nothing = few.new_zeros((len(views), rows, views.shape[1]), device="cpu")
+    return seen(exposures, nothing, (1.0, 0.0), FINEST * fringe_sampling(exposures)).to(few) - few
 
 
 def without_wall(
@@ -132,10 +137,10 @@ def without_wall(
     model does not explain stays in them. With no matter they are the frames over those of the wall.
     """
     alone = replace(exposures, wall=None)
-    found = torch.zeros_like(frames)
-    more = beside_faces(exposures, seen(exposures, found.cpu(), material)).to(frames) if is_steep(exposures) else 0.0
+    found, s = torch.zeros_like(frames), fringe_sampling(exposures)
+    more = beside_faces(exposures, seen(exposures, found.cpu(), material, s)).to(frames)
     for _ in range(ROUNDS):
-        without, within = (seen(which, found.cpu(), material).to(frames) for which in (alone, exposures))
+        without, within = (seen(which, found.cpu(), material, s).to(frames) for which in (alone, exposures))
         found = method(frames * without / (within + more).clamp_min(DARKEST), alone)
     return found
 
