@@ -24,7 +24,7 @@ import argparse
 import math
 import os
 import time
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -152,7 +152,7 @@ def run(name: str, size: str, how: str, seed: int, made: Scene) -> Row:
     grid, drawn = Grid.of_views(scan.views), made.drawn
     if how == "wall told":
         assert isinstance(made.kind, Cuvette | Channel)
-        scan = scan.beside(wall_of(made.kind, made.substances))
+        scan = scan.taken(replace(scan.exposures, wall=wall_of(made.kind, made.substances)))
         region, matter = made.within
         bodies = drawn.regions[region]
         assert isinstance(bodies, MeshScene)

@@ -14,11 +14,10 @@ from .divided_light import DividedLight
 from .frames import Binned, Cropped, Frames, Taken, binned_measured, divided, parts_of, picked
 from .geometry import Views
 from .units import BEAM_RANGE_KEV
+from .volume import Wall
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-    from .volume import Wall
 
 ENERGY_RANGE_KEV = (0.1, 1000.0)
 PIXEL_RANGE_M = (1e-10, 1e-2)
@@ -74,11 +73,9 @@ class Exposures:
             checked_distance(float(z))
         finite("psf_sigma_px", self.psf_sigma_px)
         finite("time", self.time)
-        worst = float(self.psf_sigma_px.max(initial=0.0))
+        most = float(self.psf_sigma_px.max(initial=0.0))
         require(bool(np.all(self.psf_sigma_px >= 0)), "psf_sigma_px must not be negative; correct it.")
-        require(
-            worst <= MOST_BLUR_PX, f"psf_sigma_px must be at most {MOST_BLUR_PX:g}, but it is {worst:g}; correct it."
-        )
+        require(most <= MOST_BLUR_PX, f"psf_sigma_px must be at most {MOST_BLUR_PX:g}, but it is {most:g}; correct it.")
 
     @classmethod
     def of(cls, views: Views, energy_kev: float, distance: float, psf_sigma_px: float = 0.0) -> Exposures:
@@ -109,8 +106,8 @@ class Exposures:
     def optical(self) -> Exposures:
         """The same optics on one raster of the views' pitch p; itself where all pixels are alike.
 
-        Of a pixel `s p` waves know only λz/(s p)²: frames look the same on pixels p at the distance z/s². For what
-        looks at waves and frames alone; where matter is, these exposures do not say.
+        Of a pixel `s p` waves know only λz/(s p)²: frames look the same on pixels p at z/s². Where matter is, they
+        do not say.
         """
         scales = self.views.relative
         if (scales == 1).all():
@@ -158,8 +155,8 @@ def far_from_edges(energy_kev: np.ndarray, reference_kev: float) -> np.ndarray:
     """Factors [N, 2] of δ and β at energies [N] over those at a reference energy [keV]: δ ∝ E⁻², β ∝ E⁻⁴.
 
     The electrons count as free for δ, and photoabsorption falls as E⁻³ per atom, with μ = 2kβ (Als-Nielsen & McMorrow
-    2011, *Elements of Modern X-ray Physics*, chapters 1 and 3). It holds far above all absorption edges of the matter,
-    over a narrow range of energies; where the formula is known, `materials.dispersion` has the tables' own values.
+    2011, *Elements of Modern X-ray Physics*, chapters 1 and 3). It holds far above absorption edges; of a known
+    formula `materials.dispersion` has the tables' own values.
     """
     ratio = np.asarray(energy_kev, dtype=np.float64) / reference_kev
     return np.stack((ratio**-2, ratio**-4), axis=-1)
@@ -265,15 +262,9 @@ class Scan:
         # `_FramesInMemory` takes both
         return cls(frames, exposures, is_test, provenance, light, missing)  # type: ignore[arg-type]
 
-    def taken(self, exposures: Exposures) -> Scan:
-        """The same frames with other exposures."""
-        return Scan.of(self.source, exposures, self.is_test, self.provenance, self.light, self._missing)
-
-    def beside(self, wall: Wall, said: str = "told") -> Scan:
-        """The same frames of an object in a known wall; said: what its provenance says of that."""
-        facts = self.provenance | {"wall": said}
-        exposures = replace(self.exposures, wall=wall)
-        return Scan.of(self.source, exposures, self.is_test, facts, self.light, self._missing)
+    def taken(self, exposures: Exposures, said: dict[str, str] | None = None) -> Scan:
+        """The same frames with other exposures, and what is said of these."""
+        return Scan.of(self.source, exposures, self.is_test, self.provenance | (said or {}), self.light, self._missing)
 
     def __len__(self) -> int:
         return len(self.source)

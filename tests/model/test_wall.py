@@ -12,7 +12,8 @@ import holosplat as hs
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views, rotation_tilted
 from holosplat.io.formats import read_as
-from holosplat.io.reading import Reading, Told, wall_of
+from holosplat.io.reading import Reading, Told
+from holosplat.materials import wall_of
 from holosplat.model import measure
 from holosplat.optics.retrieval import RETRIEVALS, tikhonov
 from holosplat.optics.sampling import fringe_sampling
@@ -138,27 +139,25 @@ def a_scan() -> hs.Scan:
 
 def test_what_is_said_of_a_wall():
     glass = hs.materials.parse_material("glass").delta_beta(20.0)
-    found = wall_of("tube:1e-5:2e-5:glass", a_scan())
+    found = wall_of("tube:1e-5:2e-5:glass", 20.0)
     assert found == Wall((1e-5, 1e-5), (2e-5, 2e-5), glass, round=True)
-    found = wall_of("cuvette:1e-5x2e-5:3e-5:1e-6,2e-9:glass:1e-6:0:90", a_scan())
+    found = wall_of("cuvette:1e-5x2e-5:3e-5:1e-6,2e-9:glass:1e-6:0:90", 20.0)
     assert (found.inner, found.outer, found.matter) == ((1e-5, 2e-5), (3e-5, 3e-5), (1e-6, 2e-9))
     assert (found.filling, found.centre, found.turn) == (glass, (1e-6, 0.0), pytest.approx(np.pi / 2))
-    assert wall_of("slab:1e-5:glass:glass", a_scan()).outer is None
+    assert wall_of("slab:1e-5:glass:glass", 20.0).outer is None
 
 
 @pytest.mark.parametrize(
     "text", ["tube", "pipe:1:2:glass", "tube:a:2:glass", "tube:1x2:3:glass", "slab:1:glass:water:2"]
 )
 def test_other_walls_are_refused(text):
-    scan = a_scan()
     with pytest.raises(InputError, match="--wall must be tube:INNER"):
-        wall_of(text, scan)
+        wall_of(text, 20.0)
 
 
 def test_a_hollow_is_smaller_than_its_wall():
-    scan = a_scan()
     with pytest.raises(InputError, match="greater outer section"):
-        wall_of("tube:3e-5:2e-5:glass", scan)
+        wall_of("tube:3e-5:2e-5:glass", 20.0)
 
 
 def test_a_reading_tells_the_wall(tmp_path):

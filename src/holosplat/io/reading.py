@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -20,7 +19,6 @@ from .angles import read_angles, tell_angles, tell_views
 if TYPE_CHECKING:
     from ..geometry import Views
     from ..scan import Scan
-    from ..volume import Wall
     from .beams import Beams
 
 Sense = Literal["clockwise", "anticlockwise"]
@@ -232,9 +230,12 @@ class Reading:
             scan = stitched(scan)
         tell_views(scan)
         scan = scan if self.told.tube is None else Tube.parsed(self.told.tube).taken_out_of(scan)
-        return self.part.of(
-            scan if self.told.wall is None else scan.beside(wall_of(self.told.wall, scan), self.told.wall)
-        )
+        if (said := self.told.wall) is not None:
+            from ..materials import wall_of  # xraydb, without which help is printed
+
+            wall = wall_of(said, scan.exposures.reference_energy)
+            scan = scan.taken(replace(scan.exposures, wall=wall), {"wall": said})
+        return self.part.of(scan)
 
     def as_table(self) -> dict[str, Any]:
         """What differs from the default, by field, ready for JSON; paths are absolute. `time_frame` is not there."""
@@ -344,43 +345,6 @@ def _whole(option: str, word: str) -> int:
     if found is None or abs(found) > LARGEST:
         raise InputError(f"{option} must be made of whole numbers, as in 0:91:8 or 3,5, but it says {shown(word)}.")
     return found
-
-
-SECTIONS = {"tube": 2, "cuvette": 2, "slab": 1}
-"""Kinds of walls, and how many sections each is said by."""
-
-
-def wall_of(text: str, scan: Scan) -> Wall:
-    """The wall about the rotation axis that `text` says (`Told.wall`), at the reference energy of `scan`.
-
-    Behind FILLING may stand :X:Z:TURN, the place of its middle [m] and its turn [degrees]. A material is a name, or
-    DELTA,BETA. Errors: `InputError` for anything else.
-    """
-    from ..materials import parse_material  # xraydb, without which help is printed
-    from ..volume import Wall
-
-    kind, *words = text.split(":")
-    count = SECTIONS.get(kind, 0)
-    sections = [[number_in(part) for part in word.split("x")] for word in words[:count]]
-    place = [number_in(word) for word in words[count + 2 :]]
-    good = count and len(words) - count in (1, 2, 5) and all(len(each) <= 2 - (kind == "tube") for each in sections)
-    require(
-        bool(good) and all(map(math.isfinite, [*chain(*sections), *place])),
-        "--wall must be tube:INNER:OUTER:MATERIAL:FILLING, cuvette:INNER:OUTER:MATERIAL:FILLING or "
-        f"slab:INNER:MATERIAL:FILLING, with :X:Z:TURN behind that or not, but it is {shown(text)}; write, for "
-        "instance, tube:4e-5:5e-5:glass:water.",
-    )
-
-    def matter_of(word: str) -> tuple[float, float]:
-        numbers = [number_in(part) for part in word.split(",")]
-        if len(numbers) == 2 and all(map(math.isfinite, numbers)):
-            return numbers[0], numbers[1]
-        return parse_material(word).delta_beta(scan.exposures.reference_energy)
-
-    matter, filling = (matter_of(word) if word else (0.0, 0.0) for word in [*words[count:], ""][:2])
-    x, z, turn = place or (0.0, 0.0, 0.0)
-    inner, outer = [(each[0], each[-1]) for each in sections] + [None] * (2 - count)
-    return Wall(inner, outer, matter, filling, kind == "tube", (x, z), math.radians(turn))  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
