@@ -117,8 +117,7 @@ class Exposures:
 
     @property
     def reference_energy(self) -> float:
-        """The energy [keV] for which δ and β of matter are given: `reference_kev`, or else the energy of the first
-        frame."""
+        """The energy [keV] for which δ and β of matter are given: `reference_kev`, or else that of the first frame."""
         return float(self.energy_kev[0]) if self.reference_kev is None else float(self.reference_kev)
 
     def one_energy(self, user: str) -> float:
