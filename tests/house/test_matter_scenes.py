@@ -29,7 +29,7 @@ def tables(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 def test_the_truth_is_judged_right_and_an_empty_volume_wrong(script):
-    substances, drawn, exposures = script.planned("jet", "small", 1)
+    _, substances, drawn, exposures = script.planned("jet", "small", 1)
     grid = hs.Grid.of_views(exposures.views)
     truth, bubbles = (one.voxelise(grid) for one in (drawn.scene, drawn.regions["bubbles"]))
     *scores, right = script.judged(truth, drawn, grid)
