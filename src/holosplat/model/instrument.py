@@ -71,7 +71,7 @@ class Instrument:
         )
         known = None if wall is None else wall.behind(self.views, units[:, -1, 1], units[:, -1, 0])
         self._wall = None if known is None else known.to(self.device, dtype)
-        """Line integrals [2, V, H or 1, W] of β and δ of what is known beside the object; None for nothing."""
+        """Line integrals [2, V, H or 1, W] of β and δ of the known wall; None without one."""
         self._more: Tensor | None = None
         if wall is not None:
             nothing = torch.zeros((2, len(self.views), *self.views.shape), dtype=dtype)
