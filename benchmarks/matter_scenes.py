@@ -6,10 +6,12 @@
 
 Each kind of `holosplat simulate --specimen` that may fill the field (`specimens.MATTER`) is drawn with its usual
 materials and parameters, on pixels of 1 µm, at 20 keV and 0.1 m: `large` has 96 × 96 pixels and 12 views without noise,
-`small` 64 × 64 pixels and 8 views of 3000 photons a pixel. Three runs of each are judged by the true volume:
+`small` 64 × 64 pixels and 8 views of 3000 photons a pixel. Runs of each are judged by the true volume:
 
 - `told`: the default of `reconstruct`, told the materials (of a shock: the ratio δ/β of its medium);
 - `nothing told`: the same, told nothing;
+- `wall told` (cuvette and channel): told the wall and what fills it, and the materials in that; judged by what is in
+  the wall alone, bubbles or cells;
 - `Paganin, TV`: the textbook, told the first of these materials: Paganin's filter for its contrast, of either sign,
   then total variation of its occupancy between 0 and 1.
 
@@ -22,7 +24,7 @@ import argparse
 import math
 import os
 import time
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -38,15 +40,18 @@ from holosplat.geometry import Grid, Views
 from holosplat.methods import Auto, PerView
 from holosplat.metrics import dice, volume_scores
 from holosplat.scan import Exposures, Scan
+from holosplat.specimens import MeshScene
 from holosplat.specimens.drawn import Drawn, Substances
-from holosplat.specimens.matter import MATTER
-from holosplat.volume import Volume
+from holosplat.specimens.fluids import Cuvette
+from holosplat.specimens.matter import MATTER, FieldMatter
+from holosplat.specimens.solids import Channel
+from holosplat.volume import Volume, Wall
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "data" / "matter_scenes.csv"
 PIXEL, ENERGY, DISTANCE = 1e-6, 20.0, 0.1
 SIZES = {"small": (64, 8, 3000.0), "large": (96, 12, None)}
 """Pixels along an edge, views, and photons a pixel."""
-RUNS = ("Paganin, TV", "told", "nothing told")
+RUNS = ("Paganin, TV", "told", "nothing told", "wall told")
 TEXTBOOK = PerView("paganin", "tv")
 AROUND = 2
 """Voxels around true holes in which found ones are compared with them."""
@@ -84,38 +89,57 @@ class Scene:
     scan: Scan
     substances: Substances
     drawn: Drawn
-    shock: bool
+    kind: FieldMatter
 
     def told(self, how: str) -> hs.MaterialPrior:
         """What a run is told: the materials against their medium, or the ratio of a shock's medium, or nothing; the
         textbook the first of the materials."""
         if how == "nothing told":
             return hs.MaterialPrior.unknown()
-        if self.shock:
+        if self.kind.kind == "shock":
             return hs.MaterialPrior.of_ratio(self.substances.medium.ratio)
+        if how == "wall told":
+            return hs.MaterialPrior.known(self.within[1])
         core, first = self.substances.core, self.substances.contrast
         if how == "told" and core is not None:
             return hs.MaterialPrior.known(first, core.against(self.substances.medium))
         return hs.MaterialPrior.known(first)
 
+    @property
+    def within(self) -> tuple[str, hs.DeltaBeta]:
+        """What is in the filling of the wall: the name of its region, and δ and β against the filling."""
+        material, core, medium = self.substances.material, self.substances.core, self.substances.medium
+        assert core is not None
+        bubbles = "bubbles" in self.drawn.regions
+        return ("bubbles", medium.against(core)) if bubbles else ("cells", core.against(material))
 
-def planned(name: str, size: str, seed: int) -> tuple[Substances, Drawn, Exposures]:
-    """What is in the scene of a kind that `seed` gives, the scene, and how its frames are taken."""
+
+def wall_of(kind: Cuvette | Channel, substances: Substances) -> Wall:
+    """The glass of a cuvette or of a channel, and what fills it."""
+    assert substances.core is not None
+    if isinstance(kind, Cuvette):
+        inner = kind.size * (1 - 2 * kind.wall)
+        return Wall((inner, inner), (kind.size, kind.size), substances.material, substances.core)
+    return Wall((kind.size, kind.size * kind.depth), None, substances.medium, substances.material)
+
+
+def planned(name: str, size: str, seed: int) -> tuple[FieldMatter, Substances, Drawn, Exposures]:
+    """The kind of a scene, what is in that which `seed` gives, the scene, and how its frames are taken."""
     pixels, count, _ = SIZES[size]
     kind = MATTER[name](MATTER[name].extent * pixels * PIXEL)
     material, core, medium = (_delta_beta(one) for one in kind.named)
     substances = Substances(material, None if kind.named[1] is None else core, medium)
     views = Views.evenly_spaced(count, shape=(pixels, pixels), pixel_size=PIXEL)
     exposures = Exposures.of(views, energy_kev=ENERGY, distance=DISTANCE)
-    return substances, kind.drawn(substances, seed), exposures
+    return kind, substances, kind.drawn(substances, seed), exposures
 
 
 def scene(name: str, size: str, seed: int) -> Scene:
     """The scene of a kind that `seed` gives, with its frames."""
-    substances, drawn, exposures = planned(name, size, seed)
+    kind, substances, drawn, exposures = planned(name, size, seed)
     is_test = np.zeros(len(exposures), dtype=bool)
     scan = hs.simulate(drawn.scene, exposures, photons_per_pixel=SIZES[size][2], seed=seed, is_test=is_test)
-    return Scene(scan, substances, drawn, name == "shock")
+    return Scene(scan, substances, drawn, kind)
 
 
 def _delta_beta(name: str | None) -> hs.DeltaBeta:
@@ -124,16 +148,23 @@ def _delta_beta(name: str | None) -> hs.DeltaBeta:
 
 def run(name: str, size: str, how: str, seed: int, made: Scene) -> Row:
     """One run of a scene, judged."""
-    views, began, found, verdict = made.scan.views, time.process_time(), None, ""
-    grid = Grid.of_views(views)
+    scan, began, found, verdict = made.scan, time.process_time(), None, ""
+    grid, drawn = Grid.of_views(scan.views), made.drawn
+    if how == "wall told":
+        assert isinstance(made.kind, Cuvette | Channel)
+        scan = scan.taken(replace(scan.exposures, wall=wall_of(made.kind, made.substances)))
+        region, matter = made.within
+        bodies = drawn.regions[region]
+        assert isinstance(bodies, MeshScene)
+        drawn = Drawn(MeshScene.of_one_material(bodies.meshes, matter), drawn.text)
     try:
-        done = hs.reconstruct(made.scan, made.told(how), TEXTBOOK if how == "Paganin, TV" else Auto())
+        done = hs.reconstruct(scan, made.told(how), TEXTBOOK if how == "Paganin, TV" else Auto())
         found, result = done.object.voxelise(grid), done.object.kind
         verdict = "" if done.verdict is None else "good" if done.verdict.good else "not good"
     except hs.InputError as refusal:
         result = str(refusal)
     seconds = time.process_time() - began
-    error, overlap, total, holes = judged(found, made.drawn, grid)
+    error, overlap, total, holes = judged(found, drawn, grid)
     pixels, count, photons = SIZES[size]
     return Row(
         *(name, size, how, seed, "reporting" if seed > 100 else "development"),

@@ -22,7 +22,7 @@ SHOWN = ("bubbles", "cells", "keyhole")
 
 def picture(name: str) -> None:
     """Write the picture of a kind."""
-    drawn, exposures = script("matter_scenes").planned(name, "small", SEED)[1:]
+    drawn, exposures = script("matter_scenes").planned(name, "small", SEED)[2:]
     truth = drawn.scene.voxelise(hs.Grid.of_views(exposures.views))
     scan = hs.simulate(drawn.scene, exposures[[0]], photons_per_pixel=PHOTONS, is_test=np.zeros(1, dtype=bool))
     named = next((part for part in SHOWN if part in drawn.regions), next(iter(drawn.regions)))

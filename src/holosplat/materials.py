@@ -8,12 +8,14 @@ use; energies in keV.
 
 from __future__ import annotations
 
+import math
 import re
 import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from functools import lru_cache
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +25,9 @@ import xraydb
 from .checks import InputError, in_range, require
 from .matter import DeltaBeta as DeltaBeta
 from .scan import far_from_edges
-from .tables import read_table
+from .tables import number_in, read_table, shown
 from .units import XRAYS_KEV, beam_named
+from .volume import Wall
 
 NAMES = "a name that `holosplat materials` lists, such as water, plasma, soft tissue or PMMA"
 """What messages say of named materials."""
@@ -347,3 +350,37 @@ def _table_entry(field: str, entry: Any) -> Material:
         return parse_material(entry["formula"], entry.get("density"))
     except InputError as error:
         raise InputError(f"{field}: {error}") from None
+
+
+SECTIONS = {"tube": 2, "cuvette": 2, "slab": 1}
+"""Kinds of walls, and how many sections each is said by."""
+
+
+def wall_of(text: str, energy_kev: float) -> Wall:
+    """The wall about the rotation axis that `text` says (`Told.wall`), at an energy [keV].
+
+    Behind FILLING may stand :X:Z:TURN, the place of its middle [m] and its turn [degrees]. A material is a name, or
+    DELTA,BETA. Errors: `InputError` for anything else.
+    """
+    kind, *words = text.split(":")
+    count = SECTIONS.get(kind, 0)
+    sections = [[number_in(part) for part in word.split("x")] for word in words[:count]]
+    place = [number_in(word) for word in words[count + 2 :]]
+    good = count and len(words) - count in (1, 2, 5) and all(len(each) <= 2 - (kind == "tube") for each in sections)
+    require(
+        bool(good) and all(map(math.isfinite, [*chain(*sections), *place])),
+        "--wall must be tube:INNER:OUTER:MATERIAL:FILLING, cuvette:INNER:OUTER:MATERIAL:FILLING or "
+        f"slab:INNER:MATERIAL:FILLING, with :X:Z:TURN behind that or not, but it is {shown(text)}; write, for "
+        "instance, tube:4e-5:5e-5:glass:water.",
+    )
+
+    def matter_of(word: str) -> tuple[float, float]:
+        numbers = [number_in(part) for part in word.split(",")]
+        if len(numbers) == 2 and all(map(math.isfinite, numbers)):
+            return numbers[0], numbers[1]
+        return parse_material(word).delta_beta(energy_kev)
+
+    matter, filling = (matter_of(word) if word else (0.0, 0.0) for word in [*words[count:], ""][:2])
+    x, z, turn = place or (0.0, 0.0, 0.0)
+    inner, outer = [(each[0], each[-1]) for each in sections] + [None] * (2 - count)
+    return Wall(inner, outer, matter, filling, kind == "tube", (x, z), math.radians(turn))  # type: ignore[arg-type]

@@ -14,6 +14,7 @@ from .divided_light import DividedLight
 from .frames import Binned, Cropped, Frames, Taken, binned_measured, divided, parts_of, picked
 from .geometry import Views
 from .units import BEAM_RANGE_KEV
+from .volume import Wall
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -38,6 +39,7 @@ class Exposures:
     time: [N] seconds since the first frame.
     reference_kev: the energy [keV] for which δ and β of matter are given (None: the energy of the first frame).
     bandwidth: [N] relative full widths at half maximum ΔE/E of a Gaussian spectrum about the energy; 0: one energy.
+    wall: what is known to be in the beam beside the object, and is part of every model of the frames (None: nothing).
 
     A number stands for N equal ones. Errors: `InputError` for numbers out of range.
 
@@ -60,6 +62,7 @@ class Exposures:
     time: np.ndarray
     reference_kev: float | None = None
     bandwidth: np.ndarray = field(default_factory=lambda: np.zeros(()))
+    wall: Wall | None = None
 
     def __post_init__(self) -> None:
         count = len(self.views)
@@ -76,11 +79,9 @@ class Exposures:
         finite("time", self.time)
         for width in np.unique(self.bandwidth[self.bandwidth != 0]):
             in_range("bandwidth", float(width), 1e-9, MOST_BANDWIDTH)
-        worst = float(self.psf_sigma_px.max(initial=0.0))
+        most = float(self.psf_sigma_px.max(initial=0.0))
         require(bool(np.all(self.psf_sigma_px >= 0)), "psf_sigma_px must not be negative; correct it.")
-        require(
-            worst <= MOST_BLUR_PX, f"psf_sigma_px must be at most {MOST_BLUR_PX:g}, but it is {worst:g}; correct it."
-        )
+        require(most <= MOST_BLUR_PX, f"psf_sigma_px must be at most {MOST_BLUR_PX:g}, but it is {most:g}; correct it.")
 
     @classmethod
     def of(cls, views: Views, energy_kev: float, distance: float, psf_sigma_px: float = 0.0) -> Exposures:
@@ -107,8 +108,8 @@ class Exposures:
     def optical(self) -> Exposures:
         """The same optics on one raster of the views' pitch p; itself where all pixels are alike.
 
-        Of a pixel `s p` waves know only λz/(s p)²: frames look the same on pixels p at the distance z/s². For what
-        looks at waves and frames alone; where matter is, these exposures do not say.
+        Of a pixel `s p` waves know only λz/(s p)²: frames look the same on pixels p at z/s². Where matter is, they
+        do not say.
         """
         scales = self.views.relative
         if (scales == 1).all():
@@ -118,8 +119,7 @@ class Exposures:
 
     @property
     def reference_energy(self) -> float:
-        """The energy [keV] for which δ and β of matter are given: `reference_kev`, or else the energy of the first
-        frame."""
+        """The energy [keV] for which δ and β of matter are given: `reference_kev`, or else that of the first frame."""
         return float(self.energy_kev[0]) if self.reference_kev is None else float(self.reference_kev)
 
     def one_energy(self, user: str) -> float:
@@ -156,8 +156,8 @@ def far_from_edges(energy_kev: np.ndarray, reference_kev: float) -> np.ndarray:
     """Factors [N, 2] of δ and β at energies [N] over those at a reference energy [keV]: δ ∝ E⁻², β ∝ E⁻⁴.
 
     The electrons count as free for δ, and photoabsorption falls as E⁻³ per atom, with μ = 2kβ (Als-Nielsen & McMorrow
-    2011, *Elements of Modern X-ray Physics*, chapters 1 and 3). It holds far above all absorption edges of the matter,
-    over a narrow range of energies; where the formula is known, `materials.dispersion` has the tables' own values.
+    2011, *Elements of Modern X-ray Physics*, chapters 1 and 3). It holds far above absorption edges; of a known
+    formula `materials.dispersion` has the tables' own values.
     """
     ratio = np.asarray(energy_kev, dtype=np.float64) / reference_kev
     return np.stack((ratio**-2, ratio**-4), axis=-1)
@@ -263,9 +263,9 @@ class Scan:
         # `_FramesInMemory` takes both
         return cls(frames, exposures, is_test, provenance, light, missing)  # type: ignore[arg-type]
 
-    def taken(self, exposures: Exposures) -> Scan:
-        """The same frames with other exposures."""
-        return Scan.of(self.source, exposures, self.is_test, self.provenance, self.light, self._missing)
+    def taken(self, exposures: Exposures, said: dict[str, str] | None = None) -> Scan:
+        """The same frames with other exposures, and what is said of these."""
+        return Scan.of(self.source, exposures, self.is_test, self.provenance | (said or {}), self.light, self._missing)
 
     def __len__(self) -> int:
         return len(self.source)

@@ -29,7 +29,7 @@ def tables(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 def test_the_truth_is_judged_right_and_an_empty_volume_wrong(script):
-    substances, drawn, exposures = script.planned("jet", "small", 1)
+    _, substances, drawn, exposures = script.planned("jet", "small", 1)
     grid = hs.Grid.of_views(exposures.views)
     truth, bubbles = (one.voxelise(grid) for one in (drawn.scene, drawn.regions["bubbles"]))
     *scores, right = script.judged(truth, drawn, grid)
@@ -46,15 +46,15 @@ def test_the_truth_is_judged_right_and_an_empty_volume_wrong(script):
 
 
 def test_bubbles_are_no_holes_of_the_material(script):
-    _, drawn, exposures = script.planned("bubbles", "small", 1)
+    _, _, drawn, exposures = script.planned("bubbles", "small", 1)
     grid = hs.Grid.of_views(exposures.views)
     assert script.judged(drawn.scene.voxelise(grid), drawn, grid) == (0, 1, 1, "")
 
 
 @pytest.mark.parametrize(("name", "materials"), [("jet", 1), ("cuvette", 2), ("channel", 2), ("shock", 0)])
 def test_runs_get_the_materials_of_the_scene(script, name, materials):
-    substances, drawn, _ = script.planned(name, "small", 1)
-    made = script.Scene(None, substances, drawn, name == "shock")
+    kind, substances, drawn, _ = script.planned(name, "small", 1)
+    made = script.Scene(None, substances, drawn, kind)
     if name == "shock":
         assert made.told("told").kind == "ratio"
     else:

@@ -251,7 +251,8 @@ def _volume_of(
     rays = rays_of(lines, field, Grid.of_views(field), options.backend, gaps)
     first = min(TotalVariation.first, options.iterations)
     known = {"still_light": options.still_light, "misfit": options.misfit, "two_sided": options.two_sided}
-    inside = options.inside / scan.views.finest
+    wall = scan.exposures.wall
+    inside = (options.inside or (0.0 if wall is None else wall.inside)) / scan.views.finest
     steps = TotalVariation(first=first, iterations=options.iterations - first, inside=inside, **known)
     weights = photons_left(lines, scan.exposures, material)
     return tv_solver(rays, options.upper or None, steps, partial(on_progress, "tomography"), options.backend, weights)

@@ -13,6 +13,7 @@ import torch
 
 from ..backends import Backend, device, resolve
 from ..checks import InputError, in_range, require, require_regular
+from ..geometry import Grid, Views
 from ..io.vtk import read_meshes
 from ..materials import HAEMOGLOBIN, DeltaBeta, Material, Transparent, material_of
 from ..memory import memory_kept
@@ -27,8 +28,8 @@ from ..scan import Exposures, Scan, interleaved_split
 from ..specimens.mesh_series import MeshSeries
 from ..specimens.repair import closed
 from ..specimens.scene import MeshScene
-from ..units import LENGTH_UNITS, unit_factor
-from ..volume import Object
+from ..units import LENGTH_UNITS, unit_factor, wavenumber
+from ..volume import LineIntegrals, Object, Volume, mean_wave
 from .light import EVEN_LIGHT, UnevenLight
 
 SIMULATED_FRINGE_SAMPLES = 8
@@ -128,6 +129,38 @@ class Simulation:
         return detect
 
 
+FINER = 4
+"""Times finer samples of which the mean wave is taken where one sample is too few."""
+
+
+@dataclass(frozen=True)
+class _Sharp:
+    """Meshes in one exposure, whose flat faces along the beam are sharper than samples can be (`mean_wave`)."""
+
+    obj: MeshScene | MeshSeries
+    exposures: Exposures
+
+    def at(self, time: float) -> _Sharp:
+        """The meshes at `time` [s]."""
+        return replace(self, obj=self.obj.at(time))
+
+    def project(self, views: Views) -> tuple[torch.Tensor, torch.Tensor]:
+        """(B, D) [1, H, W] [m]; of finer samples where the phase jumps by more than half a wave between two."""
+        found, k = self.obj.project(views), wavenumber(self.exposures.energy_kev)
+        (absorbed, refracted), (delta, beta) = found, self.exposures.refraction(1.0, 1.0)
+        jumps = [refracted.diff(dim=axis).abs().amax() for axis in (1, 2) if refracted.shape[axis] > 1]
+        if not jumps or float(max(jumps)) * float((k * delta).max()) <= np.pi:
+            return absorbed, refracted
+        fine = torch.stack(tuple(LineIntegrals.of_any(self.obj.project(views.refined(FINER)))[n] for n in (0, 1)))
+        parts = fine.unflatten(3, (-1, FINER)).unflatten(2, (-1, FINER)).movedim(3, 4).flatten(4)
+        B, D = mean_wave(parts, k * beta, k * delta)
+        return B, D
+
+    def voxelise(self, grid: Grid) -> Volume:
+        """δ and β of the meshes."""
+        return self.obj.voxelise(grid)
+
+
 def simulated_frames(obj: Object, exposures: Exposures, how: Simulation = Simulation()) -> Iterator[np.ndarray]:
     """Simulate frames [H, W] float32 of `obj`, one by one, without keeping them.
 
@@ -140,7 +173,7 @@ def simulated_frames(obj: Object, exposures: Exposures, how: Simulation = Simula
     with memory_kept():
         for i in range(len(exposures)):
             instrument = Instrument(exposures[[i]], fine, torch.float32, "reference", on=device(backend))
-            model = Model(obj, instrument)
+            model = Model(_Sharp(obj, exposures[[i]]) if isinstance(obj, MeshScene | MeshSeries) else obj, instrument)
             frame = np.zeros(exposures.views.shape)
             for offset in how.shutter.offsets:
                 frame += model.frames(delay=float(offset))[0].cpu().numpy()

@@ -115,6 +115,9 @@ def convert(
         require(named, f"--to is required, for {out.name} says no format by its suffix ({NXTOMO} is nxtomo); add it.")
         to = "nxtomo"
     said = writing.for_format(to)
+    require(
+        reading.told.wall is None, "--wall is part of models and changes no frames; give it to reconstruct instead."
+    )
     scan = _read(source, reading)
     prior = matter.prior(scan.exposures.reference_energy)
     wanted = evening.still_light is not None or to in GOES_WITH["material"]

@@ -25,7 +25,7 @@ Sense = Literal["clockwise", "anticlockwise"]
 WIDTHS = ("bandwidth", "source_size", "psf_sigma_px")
 """Fields of `Told` that say how wide something is, of which a range means that it may be nothing, too."""
 OWN_WAY = (
-    *("wavelength", "medium_index", "angles", "axis_column", "sense", "tube", "exposures", "allow_external"),
+    *("wavelength", "medium_index", "angles", "axis_column", "sense", "tube", "wall", "exposures", "allow_external"),
     *WIDTHS,
 )
 """Fields of `Told` that no loader takes by their own name."""
@@ -92,6 +92,9 @@ class Told:
     tube: str | None = None
     """INNER:OUTER:ATTENUATION of a tube about the axis whose wall is divided out: its diameters [m] and µ [1/m], such
     as 4e-3:4.5e-3:200."""
+    wall: str | None = None
+    """What matter lies in, which is then part of the model: tube:INNER:OUTER:MATERIAL:FILLING (diameters [m]), or
+    cuvette: (WIDTHxDEPTH each), or slab:INNER:MATERIAL:FILLING beyond the field, such as tube:4e-5:5e-5:glass:water."""
     black: Signed | None = None
     """Grey images, nerf-synthetic: intensity of black pixels, relative to the flat field (default: 0)."""
     white: Signed | None = None
@@ -273,6 +276,11 @@ class Reading:
             from .half_acquisition import Tube
 
             scan = Tube.parsed(self.told.tube).taken_out_of(scan)
+        if (said := self.told.wall) is not None:
+            from ..materials import wall_of  # xraydb, without which help is printed
+
+            wall = wall_of(said, scan.exposures.reference_energy)
+            scan = scan.taken(replace(scan.exposures, wall=wall), {"wall": said})
         return self.part.of(scan)
 
     def as_table(self) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from ..checks import require
 from ..geometry import Poses
 from ..optics.coherence import quadrature
 from ..optics.hologram import OpticalPath, Refraction, hologram, optical_path
+from ..optics.retrieval.contact import beside_faces
 from ..optics.sampling import padding
 from ..scan import Exposures, far_from_edges
 from ..units import wavenumber
@@ -84,6 +85,15 @@ class Instrument:
         self._colours = [self._colour(*each, ratio, one) for each in zip(*quadrature(exposures))]
         self.path = self._colours[len(self._colours) // 2].path
         """The waves' path at the energy nearest to the middle of the spectrum."""
+        wall = exposures.wall
+        units = wavenumber(exposures.energy_kev)[:, None, None] * ratio.reshape(len(exposures), -1, 2)
+        known = None if wall is None else wall.behind(self.views, units[:, -1, 1], units[:, -1, 0])
+        self._wall = None if known is None else known.to(self.device, dtype)
+        """Line integrals [2, V, H or 1, W] of β and δ of the known wall; None without one."""
+        self._more: Tensor | None = None
+        if wall is not None:
+            nothing = torch.zeros((2, len(self.views), *self.views.shape), dtype=dtype)
+            self._more = beside_faces(exposures, self.frames(LineIntegrals.of(*nothing)))
 
     @cached_property
     def poses(self) -> Poses:
@@ -115,13 +125,17 @@ class Instrument:
         light: likewise, energies over the planned ones [V], and bandwidths [V]. A spectrum has as many energies as the
         planned bandwidth needs, so that a fit of bandwidths starts from one above 0; else `InputError`.
         """
+        chosen = None if index is None else torch.as_tensor(index, device=self.device)
+        if self._wall is not None:
+            known = self._wall if chosen is None else self._wall[:, chosen]
+            lines = LineIntegrals.of(*(known + torch.stack((lines[0], lines[1])).to(known)))
         if len(lines.materials) > MOST_CHANNELS:
             lines = LineIntegrals.of(*lines)
-        chosen = None if index is None else torch.as_tensor(index, device=self.device)
         parts = [self._of_one(colour, lines, chosen, distance, psf_sigma_px, light) for colour in self._colours]
-        if len(parts) == 1:
-            return parts[0]
-        return sum((colour.weight * part for colour, part in zip(self._colours, parts)), torch.zeros_like(parts[0]))
+        found = parts[0]
+        if len(parts) > 1:
+            found = sum((colour.weight * part for colour, part in zip(self._colours, parts)), torch.zeros_like(found))
+        return found if self._more is None else found + (self._more if chosen is None else self._more[chosen])
 
     def _of_one(
         self,

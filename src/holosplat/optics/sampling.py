@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ..geometry import Grid
 from ..scan import Exposures
-from ..units import wavelength
+from ..units import wavelength, wavenumber
 from .propagation import fresnel_reach_px
 
 FRINGE_SAMPLES = 1.5
@@ -51,10 +51,21 @@ def fringe_sampling(exposures: Exposures, extra: int = 0) -> int:
     """Samples per detector pixel that fits and what judges them work with; extra: further ones, for safety.
 
     Frames whose first fringe is narrower than `NARROWEST_FRINGE` pixels, or that have none, need one sample a pixel.
+    Where the phase of a known wall jumps by more than half a wave from one pixel to the next, there are twice as many.
     """
+    steep = 2 if _is_steep(exposures) else 1
     exposures = exposures.optical
     seen = np.flatnonzero(fringes(exposures) >= NARROWEST_FRINGE * exposures.views.pixel_size)
-    return extra + (resolving_oversample(exposures[seen], FRINGE_SAMPLES, at_least=1) if len(seen) else 1)
+    return extra + steep * (resolving_oversample(exposures[seen], FRINGE_SAMPLES, at_least=1) if len(seen) else 1)
+
+
+def _is_steep(exposures: Exposures) -> bool:
+    """Whether samples a pixel apart are too few for the waves behind a known wall (Nyquist)."""
+    if exposures.wall is None:
+        return False
+    one_row = replace(exposures.views, shape=(1, exposures.views.shape[1]))
+    phase = exposures.wall.project(one_row)[1] * torch.from_numpy(wavenumber(exposures.energy_kev))[:, None, None]
+    return bool(((phase[:, :, 2:] - phase[:, :, :-2]).abs() > np.pi).any())  # a face within a pixel is in two steps
 
 
 def fringes(exposures: Exposures) -> np.ndarray:

@@ -68,6 +68,7 @@ def summary_of(done: Reconstruction, fit: Running | None, train: Scan) -> dict[s
             "single": matter.single,
             "delta_told": done.delta_told,
         },
+        **({"wall": to_table(train.exposures.wall)} if train.exposures.wall else {}),
         "other_materials": [each._asdict() for each in matter.others],
         "timing_s": done.timing,
         "constants": [to_table(each) for each in done.constants],

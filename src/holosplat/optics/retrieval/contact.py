@@ -8,25 +8,31 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import wraps
+from functools import partial, wraps
 from typing import Any, TypeVar, cast
 
 import numpy as np
 import scipy.ndimage as ndimage
 import torch
 from torch import Tensor
+from torch.nn.functional import interpolate, pad
 
 from ...checks import require
 from ...scan import Exposures
 from ...units import wavenumber
+from ..hologram import hologram, optical_path
 from ..noise import noise_levels, with_gaps
-from ..sampling import SharedPoses
+from ..sampling import SharedPoses, alike, fringe_sampling, padding
 from .spectra import checked, column, finest_phase
 
 UNSEEN = 0.01
 """Refraction that changes the contrast of the finest detail by less than this share of its absorption is not seen."""
 LEAST_INTENSITY = 1e-6
 """Intensity taken for the darkest pixel's, where frames have no noise that would set it."""
+FINEST = 4
+"""Times the samples of fits by which the frames of steep walls are known."""
+DARKEST = 1e-3
+"""Least intensity behind a wall that frames are divided by."""
 
 
 def _apart_px(exposures: Exposures, poses: SharedPoses) -> np.ndarray:
@@ -81,8 +87,67 @@ def contact_thickness(
     return (-torch.log(torch.maximum(frames.double(), least)) / mu.to(frames.device)).to(frames.dtype)
 
 
+ROUNDS = 3
+"""How often the frames beside a wall are made anew for a retrieval: first with no matter, then with what was found."""
+
+
+def seen(exposures: Exposures, thickness: Tensor, material: tuple[float, float], s: int) -> Tensor:
+    """Frames [V, H, W] of a thickness [V, H, W] [m] of `material` (δ, β), which goes on beyond as at the edge, and of
+    the wall of the exposures, if any; s: wave samples along a pixel's edge."""
+    found = torch.empty_like(thickness)
+    for index in alike(exposures, s):
+        part = exposures[index]
+        (my, mx), optical = padding(part, s), part.optical
+        wide = pad(thickness[index][:, None], (mx, mx, my, my), mode="replicate")
+        fine = interpolate(wide, scale_factor=s, mode="bilinear", align_corners=False)[:, 0]
+        units = [wavenumber(part.energy_kev) * share for share in part.refraction(1.0, 1.0)[::-1]]
+        lines = [fine * material[1], fine * material[0]]
+        if part.wall is not None:
+            known = part.wall.behind(part.views.padded((my, mx)).refined(s), *units)
+            lines = [mine + other.to(fine) for mine, other in zip(lines, known)]
+        B, D = (line * column(unit).to(fine) for line, unit in zip(lines, units))
+        frame = (part.views.shape, (my * s, mx * s), s)
+        blurs, pitch = optical.psf_sigma_px * s, optical.views.pitch / s
+        path = optical_path(
+            (fine.shape[1], fine.shape[2]), pitch, part.energy_kev, optical.distance, blurs, frame, fine.dtype
+        )
+        found[index] = hologram(torch.stack((D, B), 1), [(1.0, 0.0), (0.0, 1.0)], path, "reference")
+    return found
+
+
+def beside_faces(exposures: Exposures, few: Tensor) -> Tensor:
+    """What frames `few` [V, H, W] of a wall alone lack, [V, H, W]: those of `FINEST` times finer samples less them.
+
+    At flat faces along the beam waves have no end of high frequencies, and samples that hold those of what is inside
+    lack them; what they miss of the wall's own frame is the most of it.
+    """
+    views = exposures.views
+    rows = 1 if views.shares_axis else views.shape[0]
+    exposures = replace(exposures, views=replace(views, shape=(rows, views.shape[1])))
+    nothing = few.new_zeros((len(views), rows, views.shape[1]), device="cpu")
+    return seen(exposures, nothing, (1.0, 0.0), FINEST * fringe_sampling(exposures)).to(few) - few
+
+
+def without_wall(
+    method: Callable[[Tensor, Exposures], Tensor], frames: Tensor, exposures: Exposures, material: tuple[float, float]
+) -> Tensor:
+    """What `method` retrieves of `material` (δ, β) from frames [V, H, W] beside a known wall (`Exposures.wall`).
+
+    It is given the frames times `I(T) / I(T + wall)`, T being the thickness that it found before, so that all that the
+    model does not explain stays in them. With no matter they are the frames over those of the wall.
+    """
+    alone = replace(exposures, wall=None)
+    found, s = torch.zeros_like(frames), fringe_sampling(exposures)
+    more = beside_faces(exposures, seen(exposures, found.cpu(), material, s)).to(frames)
+    for _ in range(ROUNDS):
+        without, within = (seen(which, found.cpu(), material, s).to(frames) for which in (alone, exposures))
+        found = method(frames * without / (within + more).clamp_min(DARKEST), alone)
+    return found
+
+
 def or_in_contact(method: Method) -> Method:
-    """`method` for the views that show refraction, and `contact_thickness` for those that show absorption alone."""
+    """`method` for the views that show refraction, and `contact_thickness` for those that show absorption alone; beside
+    a wall that is known, for frames as if without it (`without_wall`)."""
 
     @wraps(method)
     def retrieve(
@@ -94,6 +159,9 @@ def or_in_contact(method: Method) -> Method:
         missing: Tensor | None = None,
         **options: Any,
     ) -> Tensor:
+        if exposures.wall is not None:
+            alone = partial(retrieve, delta=delta, beta=beta, missing=missing, **options)
+            return without_wall(alone, frames, exposures, (delta, beta))
         exposures = exposures.optical
         checked(frames, exposures, delta)
         poses = SharedPoses(exposures)
