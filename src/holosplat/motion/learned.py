@@ -386,7 +386,7 @@ class State:
 
 
 def _scene(states: list[State], length: float) -> tuple[Scene, Tensor]:
-    """What the network sees, and the radii [B] [m]; of bodies with few nodes, some are repeated."""
+    """The scene of the network, and the radii [B] [m]; bodies with few nodes have some of them twice."""
     radii = torch.tensor([one.radius for one in states], dtype=torch.float64)
     count = max(len(one.nodes) for one in states)
     chosen = [np.resize(one.nodes, count) for one in states]
