@@ -86,7 +86,8 @@ class Exposures:
     @classmethod
     def of(cls, views: Views, energy_kev: float, distance: float, psf_sigma_px: float = 0.0) -> Exposures:
         """Exposures that share one distance [m] and one point-spread function, all at time 0."""
-        return cls(views, *(np.full(len(views), value) for value in (energy_kev, distance, psf_sigma_px, 0.0)))
+        energy, z, blur, time = (np.full(len(views), value) for value in (energy_kev, distance, psf_sigma_px, 0.0))
+        return cls(views, energy, z, blur, time)
 
     def __len__(self) -> int:
         return len(self.views)

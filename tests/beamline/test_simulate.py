@@ -139,8 +139,8 @@ def test_single_precision_is_within_1e_4_of_the_contrast():
     third = MeshScene((*scene.meshes, *ball(1e-6).meshes), (*scene.materials, DeltaBeta(1e-6, 0.0)))
     for obj in (scene, third):
         taken = replace(views_of(20), psf_sigma_px=np.array([0.6]))
-        frame = next(simulated_frames(obj, taken, Simulation(oversample=3)))
-        exact = measure(obj, taken, 3, torch.float64)[0].numpy()
+        frame = next(simulated_frames(obj, taken, Simulation(oversample=12)))
+        exact = measure(obj, taken, 12, torch.float64)[0].numpy()
         assert np.linalg.norm(exact - 1) > 1
         assert np.linalg.norm(frame - exact) < 2e-5 * np.linalg.norm(exact - 1)
 

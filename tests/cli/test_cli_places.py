@@ -176,6 +176,7 @@ WRITTEN = {
     "materials": set(),
     "run": set(),
     "record": {"out", "truth"},
+    "rehearse": set(),
     "simulate": {"out", "truth", "true_exposures", "truth_mesh"},
     "view": set(),
 }

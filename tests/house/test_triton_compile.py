@@ -42,10 +42,10 @@ def test_no_kernel_is_compiled_anew_for_another_shape(reports):
 
 
 def test_every_kernel_was_compiled_for_every_target(reports):
-    """A kernel is what a file named triton_*.py launches: `_name[grid](…)`."""
+    """A kernel is what a file named triton_*.py or cuda.py launches: `_name[grid](…)`."""
     launched = {
         f"{path.stem}.{name}"
-        for path in SOURCE.rglob("triton_*.py")
+        for path in (*SOURCE.rglob("triton_*.py"), *SOURCE.rglob("cuda.py"))
         for name in re.findall(r"^ +(_\w+)\[.*\]\(", path.read_text(encoding="utf-8"), re.MULTILINE)
     }
     assert len(launched) > 20

@@ -145,16 +145,24 @@ class _Sharp:
         return replace(self, obj=self.obj.at(time))
 
     def project(self, views: Views) -> tuple[torch.Tensor, torch.Tensor]:
-        """(B, D) [1, H, W] [m]; of finer samples where the phase jumps by more than half a wave between two."""
-        found, k = self.obj.project(views), wavenumber(self.exposures.energy_kev)
-        (absorbed, refracted), (delta, beta) = found, self.exposures.refraction(1.0, 1.0)
-        jumps = [refracted.diff(dim=axis).abs().amax() for axis in (1, 2) if refracted.shape[axis] > 1]
-        if not jumps or float(max(jumps)) * float((k * delta).max()) <= np.pi:
+        """(B, D) [1, H, W] [m]; of finer samples where the phase jumps between two of them by more than half a wave."""
+        absorbed, refracted = self.obj.project(views)
+        if not self._jumps(refracted):
             return absorbed, refracted
         fine = torch.stack(tuple(LineIntegrals.of_any(self.obj.project(views.refined(FINER)))[n] for n in (0, 1)))
+        if not self._jumps(fine[1]):
+            return absorbed, refracted
+        k, (delta, beta) = wavenumber(self.exposures.energy_kev), self.exposures.refraction(1.0, 1.0)
         parts = fine.unflatten(3, (-1, FINER)).unflatten(2, (-1, FINER)).movedim(3, 4).flatten(4)
         B, D = mean_wave(parts, k * beta, k * delta)
         return B, D
+
+    def _jumps(self, refracted: torch.Tensor) -> bool:
+        """Whether the phase of `refracted` [1, H, W] m differs by more than half a wave between neighbours."""
+        axes = [axis for axis in (1, 2) if refracted.shape[axis] > 1]
+        most = max((float(refracted.diff(dim=axis).abs().amax()) for axis in axes), default=0.0)
+        delta = self.exposures.refraction(1.0, 1.0)[0]
+        return most * float((wavenumber(self.exposures.energy_kev) * delta).max()) > np.pi
 
     def voxelise(self, grid: Grid) -> Volume:
         """δ and β of the meshes."""

@@ -55,6 +55,7 @@ ESSENTIAL: dict[str, tuple[str, ...]] = {
     "surface": ("scan", "level", "spacing", "smoothing", "steps", "truth", *READ),
     "render": ("split", *READ),
     "evaluate": ("scan", "truth", "json", *READ),
+    "rehearse": ("times", "bins", *READ),
     "info": ("picture", *READ, "flats", "darks"),
     "convert": (*MATTER, *READ, "test_views"),
     "train": ("steps", "network", "volume", "seed", "resume"),

@@ -16,7 +16,6 @@ from dataclasses import asdict, dataclass
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -28,7 +27,7 @@ from ..checks import InputError, as_written, require
 from ..io.atomic import atomic_path
 from ..learning.weights import Card, card_of, size_of, tensors_of
 from ..mesh import TriangleMesh, across
-from ..ranges import Natural, ranged
+from ..ranges import ManyOrNone, Natural, ranged
 from ..representations import MovingSurfaces
 from ..specimens.flow.suspension import PLASMA_VISCOSITY
 from ..specimens.membrane.model import Elasticity
@@ -280,17 +279,21 @@ def read_dynamics(path: Path = SHIPPED) -> LearnedDynamics:
 
 
 @dataclass(frozen=True)
+@ranged
 class GraphForecast:
     """How bodies move on by the network."""
 
-    kind: ClassVar[str] = "graph"
-
     weights: str = ""
     """File of the network's weights (default: those of the package)."""
-    window: int = 0
+    window: ManyOrNone = 0
     """Last times of the run that the network sees (0: all)."""
     keep_volume: bool = True
     """Whether bodies keep the mean volume of the window."""
+
+    @property
+    def kind(self) -> str:
+        """Its name."""
+        return "graph"
 
     def fit(self, history: History) -> Model:
         """The network on the history."""

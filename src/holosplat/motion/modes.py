@@ -19,6 +19,7 @@ from scipy.interpolate import CubicSpline
 from ..checks import MissingError, require
 from ..inference import Decision, Score, select
 from ..mesh import across
+from ..ranges import ManyOrNone, ranged
 from ..representations import MovingSurfaces
 from .forecast import Forecast, Halves, History, Model, Places, places_of, told_by
 
@@ -38,12 +39,13 @@ SPARSE = 0.05
 
 
 @dataclass(frozen=True)
+@ranged
 class ModesForecast:
     """How bodies move on by modes of their own past."""
 
     by: Literal["dmd", "sindy"] = "dmd"
     """Which method."""
-    window: int = 0
+    window: ManyOrNone = 0
     """Last times of the run that it sees (0: all)."""
 
     @property
@@ -126,8 +128,7 @@ def _dmd(past: np.ndarray, count: int, order: tuple[int, int]) -> np.ndarray:
         found = _library("pydmd").HankelDMD(svd_rank=rank, d=delays)
         found.fit(past.T)
         found.dmd_time["tend"] = len(past) - 1 + count
-        said = np.asarray(found.reconstructed_data).T.real
-    return said[-count:]
+        return np.real(found.reconstructed_data).T[-count:]
 
 
 def _sindy(past: np.ndarray, count: int, order: tuple[int, int]) -> np.ndarray:

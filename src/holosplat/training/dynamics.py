@@ -317,5 +317,5 @@ def train_dynamics(
     data = FlowSeries.read(folder, options.device)
     training = (DynamicsTraining.resumed if resume else DynamicsTraining.begun)(data, out, options)  # pyright: ignore[reportArgumentType]
     told = DynamicsValidation(data.validation())
-    training.run(told, on_step)  # pyright: ignore[reportArgumentType]
+    training.run(told, on_step)
     return training.finish(told, who), told

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol, Self
 
 import numpy as np
 import torch
@@ -46,6 +46,18 @@ def has_bfloat16() -> bool:
     return bool(found.get("avx512_bf16") or found.get("amx_bf16"))
 
 
+class Judge(Protocol):
+    """What scores a network on data that it was not trained on."""
+
+    def judge(self, network: torch.nn.Module, step: int) -> None:
+        """Rows of scores after `step` steps."""
+        ...
+
+    def write(self, folder: Path) -> None:
+        """Write all rows."""
+        ...
+
+
 class Training:
     """A training in its folder: what is learnt, the optimiser, and the step that comes next."""
 
@@ -64,7 +76,7 @@ class Training:
         self.rows: list[tuple[float, ...]] = []
 
     @classmethod
-    def begun(cls, data: Dataset, folder: Path, options: TrainOptions) -> Training:
+    def begun(cls, data: Dataset, folder: Path, options: TrainOptions) -> Self:
         """A training in a new folder; `InputError` where there is something in it, or its device cannot be used."""
         require_device(options.device)
         if folder.exists() and any(folder.iterdir()):
@@ -74,7 +86,7 @@ class Training:
         return cls(data, folder, options)
 
     @classmethod
-    def resumed(cls, data: Dataset, folder: Path, options: TrainOptions) -> Training:
+    def resumed(cls, data: Dataset, folder: Path, options: TrainOptions) -> Self:
         """The training in `folder` after its last checkpoint; `InputError` where it is one of other options or data, or
         its device cannot be used."""
         require_device(options.device)
@@ -113,7 +125,7 @@ class Training:
         """What a checkpoint holds, by name: everything with a `state_dict`."""
         return {"network": self.network, "optimiser": self.optimiser}
 
-    def run(self, validation: Validation, on_step: Callable[[Training], None]) -> None:
+    def run(self, validation: Judge, on_step: Callable[[Training], None]) -> None:
         """All steps that are left; a checkpoint, curves and a validation every `keep_every` steps and at the end.
 
         on_step: called after each step. What is interrupted goes on from the last checkpoint.
@@ -151,7 +163,7 @@ class Training:
             value, scores = loss(self.network, shown.on(self.options.device), self.options.goal)
         return value, scores.tolist()
 
-    def keep(self, validation: Validation) -> None:
+    def keep(self, validation: Judge) -> None:
         """Write the checkpoint, the curves and the validation, each whole or not at all."""
         state: dict[str, Any] = {name: part.state_dict() for name, part in self.parts().items()}
         write_state(self.folder / CHECKPOINT, state | {"step": self.step, "rows": [list(row) for row in self.rows]})
