@@ -37,7 +37,7 @@ from holosplat.motion.elastic import Rest
 from holosplat.motion.forecast import Forecast, Forecaster, Halves, History, PathForecast, extrapolate
 from holosplat.motion.learned import GraphForecast
 from holosplat.motion.measures import half_sets
-from holosplat.motion.modes import ModesForecast
+from holosplat.motion.modes import DmdForecast, SindyForecast
 from holosplat.motion.track import TrackOptions, follow
 from holosplat.representations import MovingSurfaces
 from holosplat.representations.paths import TimeBasis
@@ -60,8 +60,8 @@ MODELS = {
 }
 LEARNED: dict[str, Forecaster] = {
     "graph": GraphForecast(),
-    "dmd": ModesForecast("dmd"),
-    "sindy": ModesForecast("sindy"),
+    "dmd": DmdForecast(),
+    "sindy": SindyForecast(),
 }
 DICE = ("paths", "auto")
 PIECES = 3

@@ -10,7 +10,7 @@ import pytest
 from holosplat.checks import InputError, MissingError
 from holosplat.matter import Matter
 from holosplat.motion.forecast import History
-from holosplat.motion.modes import ModesForecast, _dmd, _sindy
+from holosplat.motion.modes import DmdForecast, SindyForecast, _dmd, _sindy
 from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.specimens.red_cells import icosphere
 
@@ -36,10 +36,10 @@ def bodies() -> MovingSurfaces:
     return MovingSurfaces.of_bodies(paths, [FACES, FACES], basis, 0.5e-6, Matter.one(1e-7, 0.0))
 
 
-@pytest.mark.parametrize("by", ["dmd", "sindy"])
-def test_a_damped_swing_goes_on(by):
-    pytest.importorskip({"dmd": "pydmd", "sindy": "pysindy"}[by])
-    found = ModesForecast(by).fit(History(bodies(), TIMES)).ahead(AHEAD)
+@pytest.mark.parametrize(("by", "library"), [(DmdForecast(), "pydmd"), (SindyForecast(), "pysindy")])
+def test_a_damped_swing_goes_on(by, library):
+    pytest.importorskip(library)
+    found = by.fit(History(bodies(), TIMES)).ahead(AHEAD)
     for body in range(2):
         still = np.abs(places(TIMES[-1:], body) - places(AHEAD[-1:], body)).max()
         for time in AHEAD:
@@ -71,7 +71,7 @@ def test_equations_that_run_away_leave_the_last_shape():
 def test_what_is_missing_is_said(monkeypatch):
     short = History(bodies(), TIMES[:6])
     with pytest.raises(InputError, match=r"--by dmd must see 9 times at least, but the run has 6; take --by paths"):
-        ModesForecast("dmd").fit(short)
+        DmdForecast().fit(short)
     loaded = importlib.import_module
 
     def gone(name: str, *rest: str):
@@ -81,4 +81,4 @@ def test_what_is_missing_is_said(monkeypatch):
 
     monkeypatch.setattr(importlib, "import_module", gone)
     with pytest.raises(MissingError, match=r"needs pydmd: pip install 'holosplat\[dynamics\]'"):
-        ModesForecast("dmd").fit(History(bodies(), TIMES))
+        DmdForecast().fit(History(bodies(), TIMES))

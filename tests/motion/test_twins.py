@@ -107,7 +107,7 @@ def test_frames_tell_a_body_from_its_twin(monkeypatch):
     found, decision = chosen_twins(twinned(truth, 0, ACROSS), trials, heard.append)
     assert decision is not None
     assert decision.choice == "0"
-    assert {one.name: one.wins for one in decision.compared} == {"twin of body 0": True, "twin of body 1": False}
+    assert {one.name: one.likelier for one in decision.compared} == {"twin of body 0": True, "twin of body 1": False}
     for number, turn in enumerate((TURN, OTHER)):
         axes = np.linalg.eigh(moments(found.bodies(float(TIMES[1]))[number])[2])[1]
         assert abs(axes[:, 0] @ turn[:, 2]) > 0.98

@@ -17,7 +17,7 @@ from ..motion.dynamics import DynamicsForecast
 from ..motion.fit import MotionFit
 from ..motion.forecast import PathForecast
 from ..motion.learned import GraphForecast
-from ..motion.modes import ModesForecast
+from ..motion.modes import DmdForecast, SindyForecast
 from ..planning.acts import of_forecast
 from ..ranges import Many, Positive, Seconds, Seed, Signed, Small, ranged
 from ..report.run import report_run
@@ -101,9 +101,9 @@ class ForecastFlags:
         learned, decides = self._learned(), self.by == "auto"
         return ForecastOptions(self.times, step, model, self._dynamics(), learned, decides, self.half_sets, fit)
 
-    def _learned(self) -> GraphForecast | ModesForecast | None:
+    def _learned(self) -> GraphForecast | DmdForecast | SindyForecast | None:
         if self.by == "dmd" or self.by == "sindy":
-            return ModesForecast(self.by, self.window)
+            return (DmdForecast if self.by == "dmd" else SindyForecast)(self.window)
         if self.by == "graph" or (self.by == "auto" and self.channel is None):
             return GraphForecast(self.weights, self.window, self.keep_volume)
         return None

@@ -39,6 +39,11 @@ class Compared:
         return self.gain < -self._sure
 
     @property
+    def likelier(self) -> bool:
+        """Whether the gain is sure, of whatever size: enough where neither of the two is simpler or changes frames."""
+        return self.gain > ERRORS * self.error
+
+    @property
     def open(self) -> bool:
         """Whether the gain may yet be of practical size, as far as its error tells."""
         return self.gain + ERRORS * self.error > LEAST

@@ -228,10 +228,8 @@ class Model:
 class Forecaster(Protocol):
     """A way in which bodies go on."""
 
-    @property
-    def kind(self) -> str:
-        """Its name."""
-        ...
+    kind: ClassVar[str]
+    """Its name."""
 
     def fit(self, history: History) -> Model:
         """The motion that the history tells."""

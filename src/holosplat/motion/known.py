@@ -19,7 +19,7 @@ from ..bodies.shadows import Shadows
 from ..checks import require
 from ..fit.run import Run
 from ..geometry import Views
-from ..inference import Compared, Decision, Score
+from ..inference import ERRORS, Compared, Decision, Score
 from ..matter import DeltaBeta, Matter
 from ..mesh import TriangleMesh
 from ..optics.background import Light
@@ -227,35 +227,34 @@ def chosen_twins(
 ) -> tuple[MovingSurfaces, Decision | None]:
     """`bodies` of known rest shape, each or its twin, and the decision; as they are for other than two beams.
 
-    Frames are divided by those that all others predict, and the body, the null, and its twin are fitted to them, from
-    shapes without details: those that were fitted before would speak for the body that was there. A twin that is surely
-    worse after a stiff fit has no soft one. Where neither is surely better after that, both fits go on when all others
-    have been looked at.
+    Frames are divided by those that all others predict, and the body and its twin are fitted to them, from shapes
+    without details: those that were fitted before would speak for the body that was there. The two are alike in
+    everything but their pose, so that the likelier one is taken, by however little, if that is sure; a stiff fit alone
+    does not tell, for its residual is that of shapes. Where neither is surely likelier, both fits go on when all others
+    have been looked at; the body stays in the end.
     """
     beams = two_beams(trials.train.views)
     if beams is None:
         return bodies, None
     plain, now = without_details(bodies, trials.rest), bodies
-    asked, rivals = in_question(plain, beams, trials.rest), dict[int, tuple[Tried, Tried]]()
+    asked, fits = in_question(plain, beams, trials.rest), dict[int, tuple[Tried, ...]]()
     compared = dict[int, Compared]()
+
+    def compare(number: int, frames: Scan, tried: Sequence[Tried]) -> None:
+        nonlocal now
+        body, twin = fits[number] = tuple(trials.gone_on(frames, one) for one in tried)
+        compared[number] = twin.beside(body, number)
+        now = _placed(now, number, twin.bodies) if compared[number].likelier else now
+
     for turn, number in enumerate(asked):
         on_progress(FIRST_LOOK * turn / len(asked))
         frames, own = trials.beside(now, number), only(plain, [number])
-        first, other = (trials.begun(frames, start) for start in (own, twinned(own, 0, beams)))
-        compared[number] = other.beside(first, number)
-        if compared[number].loses:
-            continue
-        first, other = rivals[number] = trials.gone_on(frames, first), trials.gone_on(frames, other)
-        compared[number] = other.beside(first, number)
-        now = _placed(now, number, other.bodies) if compared[number].wins else now
-    close = [k for k in rivals if not (compared[k].wins or compared[k].loses)]
+        compare(number, frames, [trials.begun(frames, start) for start in (own, twinned(own, 0, beams))])
+    close = [number for number, each in compared.items() if abs(each.gain) <= ERRORS * each.error]
     for turn, number in enumerate(close):
         on_progress(FIRST_LOOK + (1 - FIRST_LOOK) * turn / len(close))
-        frames = trials.beside(now, number)
-        first, other = (trials.gone_on(frames, tried) for tried in rivals[number])
-        compared[number] = other.beside(first, number)
-        now = _placed(now, number, other.bodies) if compared[number].wins else now
-    taken = ", ".join(str(number) for number, each in compared.items() if each.wins)
+        compare(number, trials.beside(now, number), fits[number])
+    taken = ", ".join(str(number) for number, each in compared.items() if each.likelier)
     return now, Decision(NAME, taken or NONE, "training frames", tuple(compared.values()))
 
 

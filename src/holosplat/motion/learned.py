@@ -16,6 +16,7 @@ from dataclasses import asdict, dataclass
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -283,17 +284,14 @@ def read_dynamics(path: Path = SHIPPED) -> LearnedDynamics:
 class GraphForecast:
     """How bodies move on by the network."""
 
+    kind: ClassVar[str] = "graph"
+
     weights: str = ""
     """File of the network's weights (default: those of the package)."""
     window: ManyOrNone = 0
     """Last times of the run that the network sees (0: all)."""
     keep_volume: bool = True
     """Whether bodies keep the mean volume of the window."""
-
-    @property
-    def kind(self) -> str:
-        """Its name."""
-        return "graph"
 
     def fit(self, history: History) -> Model:
         """The network on the history."""

@@ -11,7 +11,7 @@ import importlib
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -43,26 +43,22 @@ SPARSE = 0.05
 class ModesForecast:
     """How bodies move on by modes of their own past."""
 
-    by: Literal["dmd", "sindy"] = "dmd"
+    kind: ClassVar[str]
     """Which method."""
+
     window: ManyOrNone = 0
     """Last times of the run that it sees (0: all)."""
-
-    @property
-    def kind(self) -> str:
-        """Its name."""
-        return self.by
 
     def fit(self, history: History) -> Model:
         """What the past tells; `InputError` for fewer than `LEAST` times, `MissingError` without the extra."""
         window = history.last(self.window)
         require(
             len(window) >= LEAST,
-            f"--by {self.by} must see {LEAST} times at least, but the run has {len(window)}; take --by paths.",
+            f"--by {self.kind} must see {LEAST} times at least, but the run has {len(window)}; take --by paths.",
         )
-        one = _dmd if self.by == "dmd" else _sindy
+        one = WAYS[self.kind]
         order = self.decided(history.bodies, window)
-        chosen = next(each for each in ORDERS[self.by] if str(each) == order.choice)
+        chosen = next(each for each in ORDERS[self.kind] if str(each) == order.choice)
 
         def say(
             bodies: MovingSurfaces, times: np.ndarray, ahead: np.ndarray, halves: Halves | None
@@ -84,18 +80,34 @@ class ModesForecast:
         """The order that tells the last third of the window best from what is before, over all bodies."""
         early, late = np.split(window, [(2 * len(window) + 2) // 3])
         truth = places_of(bodies, late)
-        one = _dmd if self.by == "dmd" else _sindy
+        one = WAYS[self.kind]
         kept = dict[str, Score]()
 
         def score(name: str, fold: int) -> Score:
             if name not in kept:
-                order = next(each for each in ORDERS[self.by] if str(each) == name)
+                order = next(each for each in ORDERS[self.kind] if str(each) == name)
                 said = _places(bodies, early, late, order, one)
                 kept[name] = Score(np.array([[((a - b) ** 2).mean()] for a, b in zip(said, truth)]))
             return kept[name]
 
-        names = [str(each) for each in ORDERS[self.by]]
+        names = [str(each) for each in ORDERS[self.kind]]
         return select("order of the modes", names, score, by="the last third of the run's times")
+
+
+@dataclass(frozen=True)
+@ranged
+class DmdForecast(ModesForecast):
+    """How bodies move on by dynamic modes of their own past."""
+
+    kind: ClassVar[str] = "dmd"
+
+
+@dataclass(frozen=True)
+@ranged
+class SindyForecast(ModesForecast):
+    """How bodies move on by sparse equations of modes of their own past."""
+
+    kind: ClassVar[str] = "sindy"
 
 
 Ahead = Callable[[np.ndarray, int, tuple[int, int]], np.ndarray]
@@ -166,3 +178,6 @@ def _library(name: str) -> Any:
         return importlib.import_module(name)
     except ImportError:
         raise MissingError(f"this forecast needs {name}: pip install 'holosplat[dynamics]'.") from None
+
+
+WAYS: dict[str, Ahead] = {"dmd": _dmd, "sindy": _sindy}

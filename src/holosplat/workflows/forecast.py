@@ -23,7 +23,7 @@ from ..motion.fit import MotionFit
 from ..motion.forecast import Forecast, Halves, History, PathForecast, decided
 from ..motion.learned import GraphForecast
 from ..motion.measures import LEAST, half_sets
-from ..motion.modes import ModesForecast
+from ..motion.modes import DmdForecast, SindyForecast
 from ..optics.background import Light
 from ..progress import FitProgress
 from ..ranges import Many, Seconds, ranged
@@ -61,7 +61,7 @@ class ForecastOptions:
     """How paths go on."""
     dynamics: DynamicsForecast | None = None
     """How cells go on by mechanics (default: all bodies go on their paths)."""
-    learned: GraphForecast | ModesForecast | None = None
+    learned: GraphForecast | DmdForecast | SindyForecast | None = None
     """How bodies go on by what was learnt, and not on their paths."""
     decides: bool = False
     """Whether paths decide against what was learnt, by the last third of the run's times."""
@@ -127,9 +127,12 @@ def tracked_bodies(run: Reconstruction) -> MovingSurfaces:
 
 
 def require_cells(run: Reconstruction, times: np.ndarray, options: ForecastOptions) -> None:
-    """`InputError` where mechanics have no cell to carry on after the tracked `times` [T] s, before any fit."""
+    """`InputError`, before any fit, where mechanics have no cell to carry on after the tracked `times` [T] s, and where
+    what was learnt cannot be asked; `MissingError` without its library."""
     if options.dynamics is not None:
         window_of(tracked_bodies(run), times, options.ahead(times), options.dynamics, options.model)
+    elif options.learned is not None and not options.decides:
+        options.learned.fit(History(tracked_bodies(run), times, None)).ahead(options.ahead(times))
 
 
 def forecast(
