@@ -86,8 +86,7 @@ class Exposures:
     @classmethod
     def of(cls, views: Views, energy_kev: float, distance: float, psf_sigma_px: float = 0.0) -> Exposures:
         """Exposures that share one distance [m] and one point-spread function, all at time 0."""
-        energy, z, blur, time = (np.full(len(views), value) for value in (energy_kev, distance, psf_sigma_px, 0.0))
-        return cls(views, energy, z, blur, time)
+        return cls(views, np.array(energy_kev), np.array(distance), np.array(psf_sigma_px), np.array(0.0))
 
     def __len__(self) -> int:
         return len(self.views)

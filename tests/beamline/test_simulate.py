@@ -5,13 +5,11 @@ from __future__ import annotations
 import tracemalloc
 import weakref
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from scipy.special import fresnel
 
 import holosplat.io.volumes as volumes
 from holosplat.beamline.misalignment import GEOMETRIES, Directions, Misalignment
@@ -24,11 +22,9 @@ from holosplat.materials import DeltaBeta
 from holosplat.mesh import TriangleMesh
 from holosplat.model import measure
 from holosplat.scan import Exposures, Scan
-from holosplat.specimens.drawn import box_mesh
 from holosplat.specimens.mesh_series import MeshSeries
 from holosplat.specimens.red_cells import icosphere
 from holosplat.specimens.scene import MeshScene
-from holosplat.units import wavenumber
 
 PIXEL = 1e-6
 SHAPE = (31, 44)
@@ -147,44 +143,6 @@ def test_single_precision_is_within_1e_4_of_the_contrast():
         exact = measure(_Sharp(obj, taken), taken, 3, torch.float64)[0].numpy()
         assert np.linalg.norm(exact - 1) > 1
         assert np.linalg.norm(frame - exact) < 2e-5 * np.linalg.norm(exact - 1)
-
-
-@pytest.mark.parametrize("phase", [1.0, 2.0, 4.0])
-def test_flat_faces_along_the_beam(phase):
-    """A slab between two faces along the beam: its wave is 1 + (exp(-iφ) - 1)(F(x - a) - F(x - b)), F by Fresnel's
-    integrals (Born & Wolf 1999, 8.7.3). The error of frames falls with their samples, the wave's mean is better than
-    that of the phase, and what lies between the faces is not changed."""
-    shape, pixel, energy, z = (5, 63), 0.5e-6, 20.0, 0.05
-    k = float(wavenumber(energy))
-    left, right, depth = -6.13e-6, 5.29e-6, phase / (k * GLASS.delta)
-    slab = MeshScene((box_mesh((left, -1e-4, -depth / 2), (right, 1e-4, depth / 2)),), (DeltaBeta(GLASS.delta, 0.0),))
-    taken = Exposures.of(Views.from_angles([0.0], shape, pixel), energy, z)
-    parts = 100
-    x = ((np.arange(shape[1] * parts) + 0.5) / parts - shape[1] / 2) * pixel
-    sine, cosine = fresnel(np.sqrt(k / (np.pi * z)) * (x - np.array([[left], [right]])))
-    edges = 0.5 + (cosine + 1j * sine) * (1 - 1j) / 2
-    wave = 1 + (np.exp(-1j * phase) - 1) * (edges[0] - edges[1])
-    exact = (np.abs(wave) ** 2).reshape(shape[1], parts).mean(1)
-
-    def error(frame: np.ndarray) -> float:
-        return float(np.linalg.norm(frame[2] - exact) / np.linalg.norm(exact - 1))
-
-    found = [error(next(simulated_frames(slab, taken, Simulation(oversample=n)))) for n in (4, 6, 8, 12)]
-    assert all(later < 0.8 * before for before, later in pairwise(found))
-    assert found[0] < 0.05
-    assert found[2] < 0.02
-    assert error(measure(slab, taken, 4, torch.float64)[0].numpy()) > 0.05
-
-
-def test_what_is_not_steep_is_sampled_as_it_was():
-    """A ball of glass, whose phase changes slowly, bit for bit; of a steep one frames come nearer to the limit."""
-    taken, soft = views_of(20), ball(6e-6, matter=DeltaBeta(4e-7, 0.0))
-    np.testing.assert_array_equal(_Sharp(soft, taken).project(taken.views)[1], soft.project(taken.views)[1])
-    steep, limit = ball(6e-6, matter=DeltaBeta(1e-5, 0.0)), 24
-    exact = measure(steep, taken, limit, torch.float64)[0]
-    found = [measure(obj, taken, 6, torch.float64)[0] for obj in (_Sharp(steep, taken), steep)]
-    sharp, plain = (float((frame - exact).norm()) for frame in found)
-    assert sharp < 0.9 * plain
 
 
 def test_materials_may_be_many_and_add_up():

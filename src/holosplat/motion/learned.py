@@ -389,8 +389,7 @@ class State:
 def _scene(states: list[State], length: float) -> tuple[Scene, Tensor]:
     """The scene of the network, and the radii [B] [m]; bodies with few nodes have some of them twice."""
     radii = torch.tensor([one.radius for one in states], dtype=torch.float64)
-    count = max(len(one.nodes) for one in states)
-    chosen = [np.resize(one.nodes, count) for one in states]
+    chosen = [np.resize(one.nodes, max(len(each.nodes) for each in states)) for one in states]
     own = torch.stack([one.own[nodes] for one, nodes in zip(states, chosen)])
     normals = torch.stack([one.normals[nodes] for one, nodes in zip(states, chosen)])
     middle = torch.stack([one.middle for one in states])
