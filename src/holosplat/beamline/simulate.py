@@ -132,6 +132,9 @@ class Simulation:
 STEEP = 0.25
 """Phase [rad] between neighbours from which on a sample is looked at more finely: a jump of four times as much, 4
 samples a pixel, is wrong by 6 % of the contrast without that (`test_flat_faces_along_the_beam`)."""
+JUMP = 0.49
+"""Part of a sample's range of phases that lies between two finer ones at a jump: half, where rays part it in two. Means
+of the wave where the phase is steep and smooth would lose light."""
 FINER, TILE, TOGETHER = 8, 8, 256
 """Finer samples along a sample's edge, samples along the edge of a tile, and tiles that are projected at once."""
 
@@ -159,11 +162,13 @@ class _Sharp:
             shifts = [views.cropped(slice(i, i + h), slice(j, j + w)).shifts for i, j in some]
             raster = replace(views[[0] * len(some)], shape=(h, w), shifts=np.concatenate(shifts)).refined(FINER)
             parts = self._lines(raster).unflatten(3, (w, FINER)).unflatten(2, (h, FINER)).movedim(3, 4)
-            jumps = [steep * parts[1].diff(dim=axis).abs().amax(dim=(3, 4)) > STEEP for axis in (3, 4)]
+            extent = steep * (parts[1].amax(dim=(3, 4)) - parts[1].amin(dim=(3, 4)))
+            steps = [steep * parts[1].diff(dim=axis).abs().amax(dim=(3, 4)) for axis in (3, 4)]
+            jumps = (torch.maximum(*steps) > JUMP * extent) & (extent > STEEP)
             mean = mean_wave(parts.flatten(4), (k * beta).repeat(len(some)), (k * delta).repeat(len(some)))
             for n, (i, j) in enumerate(some):
                 there = lines[:, 0, i : i + h, j : j + w]
-                there.copy_(torch.where(jumps[0][n] | jumps[1][n], mean[:, n], there))
+                there.copy_(torch.where(jumps[n], mean[:, n], there))
         return lines[0], lines[1]
 
     def _lines(self, views: Views) -> torch.Tensor:
