@@ -34,8 +34,8 @@ from .light import EVEN_LIGHT, UnevenLight
 
 SIMULATED_FRINGE_SAMPLES = 8
 """Samples on the first fringe in simulations: frames of the benchmark are then right to 1 % of their contrast (rms),
-most of them to half of that (docs/data/propagation.csv); faces exactly along the beam, where the phase jumps, to 1 or
-2 % (`_Sharp`)."""
+most of them to half of that (docs/data/propagation.csv); faces exactly along the beam, where the phase jumps, to 1 to
+4 % (`_Sharp`)."""
 MOST_PULSES = 10_000
 
 
