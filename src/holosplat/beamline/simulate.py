@@ -129,12 +129,10 @@ class Simulation:
         return detect
 
 
-STEEP = 1.0
-"""Range of phases [rad] within a sample from which on the mean of the wave is taken: one of 1, at 4 samples a pixel, is
-wrong by 6 % of its contrast without that, and one of 2 by 8 % (`test_flat_faces_along_the_beam`)."""
-JUMP = 0.49
-"""Part of a sample's range of phases that lies between two finer ones at a jump: half, where rays part it in two. Means
-of the wave where the phase is steep and smooth would lose light."""
+STEEP = 0.5
+"""Phase [rad] between neighbours from which on a sample is looked at more finely, and between finer ones from which on
+it is the mean of their waves. Faces along the beam part in two there; edges of cells are less steep, and means of what
+is smooth would lose light (docs/data/faces.csv)."""
 FINER, TILE, TOGETHER = 8, 8, 256
 """Finer samples along a sample's edge, samples along the edge of a tile, and tiles that are projected at once."""
 
@@ -155,16 +153,15 @@ class _Sharp:
         """(B, D) [1, H, W] [m]."""
         lines = self._lines(views)
         k, (delta, beta) = wavenumber(self.exposures.energy_kev), self.exposures.refraction(1.0, 1.0)
-        steep, (h, w) = float((k * delta)[0]), (min(TILE, n) for n in views.shape)
-        places = self._tiles(steep * lines[1, 0], h, w)
+        k_delta, (h, w) = float((k * delta)[0]), (min(TILE, n) for n in views.shape)
+        places = self._tiles(k_delta * lines[1, 0], h, w)
         for first in range(0, len(places), TOGETHER):
             some = places[first : first + TOGETHER]
             shifts = [views.cropped(slice(i, i + h), slice(j, j + w)).shifts for i, j in some]
             raster = replace(views[[0] * len(some)], shape=(h, w), shifts=np.concatenate(shifts)).refined(FINER)
             parts = self._lines(raster).unflatten(3, (w, FINER)).unflatten(2, (h, FINER)).movedim(3, 4)
-            extent = steep * (parts[1].amax(dim=(3, 4)) - parts[1].amin(dim=(3, 4)))
-            steps = [steep * parts[1].diff(dim=axis).abs().amax(dim=(3, 4)) for axis in (3, 4)]
-            jumps = (torch.maximum(*steps) > JUMP * extent) & (extent > STEEP)
+            steps = [parts[1].diff(dim=axis).abs().amax(dim=(3, 4)) for axis in (3, 4)]
+            jumps = k_delta * torch.maximum(*steps) > STEEP
             mean = mean_wave(parts.flatten(4), (k * beta).repeat(len(some)), (k * delta).repeat(len(some)))
             for n, (i, j) in enumerate(some):
                 there = lines[:, 0, i : i + h, j : j + w]
@@ -179,7 +176,7 @@ class _Sharp:
     @staticmethod
     def _tiles(phase: torch.Tensor, h: int, w: int) -> list[tuple[int, int]]:
         """First rows and columns of the tiles of h × w samples in which `phase` [H, W] rad is steep."""
-        rows, columns = (torch.nonzero(phase.diff(dim=axis).abs().cpu() > STEEP / 2) for axis in (0, 1))
+        rows, columns = (torch.nonzero(phase.diff(dim=axis).abs().cpu() > STEEP) for axis in (0, 1))
         near = torch.cat([rows, rows + torch.tensor([1, 0]), columns, columns + torch.tensor([0, 1])])
         last = torch.tensor([phase.shape[0] - h, phase.shape[1] - w])
         found = torch.minimum(near // torch.tensor([h, w]) * torch.tensor([h, w]), last)
