@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.special import fresnel
 
-from holosplat.beamline.simulate import Simulation, _Sharp, simulated_frames
+from holosplat.beamline.simulate import Simulation, _may_jump, _Sharp, _tiles, simulated_frames
 from holosplat.geometry import Views
 from holosplat.materials import DeltaBeta
 from holosplat.mesh import TriangleMesh
@@ -56,23 +56,33 @@ def test_flat_faces_along_the_beam(phase, turned):
     assert error(measure(slab, taken, 4, torch.float64)[0].numpy()) > 0.05
 
 
-def test_what_is_not_steep_is_sampled_as_it_was():
-    """Soft balls, whose phase does not jump, bit for bit: one that is not looked at more
-    finely, and one that is. Frames of a steep one come nearer to the limit."""
-    taken = Exposures.of(Views.from_angles([20.0], (31, 44), 1e-6), 20.0, 0.02)
-    soft, steep, limit = ball(6e-6, 4e-7), ball(6e-6, 1e-5), 24
-    for one in (soft, ball(6e-6, 1.2e-6)):
-        np.testing.assert_array_equal(_Sharp(one, taken).project(taken.views)[1], one.project(taken.views)[1])
-    exact = measure(steep, taken, limit, torch.float64)[0]
-    found = [measure(obj, taken, 6, torch.float64)[0] for obj in (_Sharp(steep, taken), steep)]
-    sharp, plain = (float((frame - exact).norm()) for frame in found)
-    assert sharp < 0.9 * plain
+@pytest.mark.parametrize("delta", [4e-7, 1.2e-6, 1e-5])
+def test_round_edges_are_sampled_as_they_were(delta):
+    """Bit for bit, on six samples a pixel: the mean of the wave would lose light there."""
+    views, obj = Views.from_angles([20.0], (31, 44), 1e-6), ball(6e-6, delta)
+    taken, fine = Exposures.of(views, 20.0, 0.02), views.refined(6)
+    np.testing.assert_array_equal(_Sharp(obj, taken)._lines(fine), torch.stack(_Sharp(obj, taken).project(fine)))
 
 
-def test_both_sides_of_a_face_between_tiles_are_looked_at():
-    """And a last tile that would stand out of the raster ends with it."""
-    phase = torch.zeros(19, 21)
-    phase[:, 8:] = 2
-    assert _Sharp._tiles(phase, 8, 8) == [(i, j) for i in (0, 8, 11) for j in (0, 8)]
-    assert _Sharp._tiles(phase.T[:, :11].contiguous(), 8, 8) == [(i, j) for i in (0, 8) for j in (0, 3)]
-    assert _Sharp._tiles(0.2 * phase, 8, 8) == []
+def test_a_bevel_in_one_sample_is_no_jump():
+    """Four fifths of a sample wide, of 3 rad: it is looked at more finely, and no two of these differ by half a radian;
+    the face across from it is a jump."""
+    taken = Exposures.of(Views.from_angles([0.0], (15, 31), 1e-6), 20.0, 0.02)
+    box = box_mesh((-0.4e-6, -1e-4, 0.0), (9e-6, 1e-4, 3 / (float(wavenumber(20.0)) * DELTA)))
+    bevelled = box.vertices.copy()
+    bevelled[(bevelled[:, 0] < 0) & (bevelled[:, 2] > 0), 0] += 0.8e-6
+    obj = _Sharp(MeshScene((TriangleMesh(bevelled, box.faces),), (DeltaBeta(DELTA, 0.0),)), taken)
+    before, after = obj._lines(taken.views), torch.stack(obj.project(taken.views))
+    assert _may_jump(float(wavenumber(20.0)) * before[1, 0])[7].nonzero().flatten().tolist() == [15, 24]
+    assert (before != after).any(dim=0)[0, 7].nonzero().flatten().tolist() == [24]
+
+
+def test_samples_within_which_the_phase_may_jump():
+    """Not those of a slope, of a round edge, or of a small step; a last tile ends with the raster."""
+    x = torch.arange(21.0)[None].expand(19, 21)
+    step = 1.5 * (x > 7) + 0.5 * (x > 8)
+    assert _may_jump(step).nonzero().unique(dim=0).tolist() == [[i, 8] for i in range(19)]
+    assert torch.equal(_may_jump(step.T), _may_jump(step).T)
+    for still in (3 * x, 9 * (x - 7.3).clamp_min(0).sqrt(), 0.4 * step):
+        assert not _may_jump(still).any()
+    assert _tiles(_may_jump(step), 8, 8) == [(i, j) for i in (0, 8, 11) for j in (8,)]

@@ -14,8 +14,8 @@ WATER = f"holosplat simulate --specimen bubbles --specimen-count 2 --medium wate
 RUN = f"{SCAN} seen.nxs && holosplat reconstruct seen.nxs --material haemoglobin --preset fast --out"
 FLOW = """
 holosplat grow --cells 1 --box 16e-6 12e-6 12e-6 --flow 0.05 --snapshots 4 --frequency 3 --out grown
-holosplat simulate grown/cells.pvd --frame-rate 56400 --material haemoglobin --detector 24 24 --pixel-size 0.6e-6 \\
-    --views 3 --test-every 0 --out scan.nxs
+holosplat simulate grown/cells.pvd --period 16 0 0 --frame-rate 56400 --material haemoglobin --detector 24 24 \\
+    --pixel-size 0.6e-6 --views 3 --test-every 0 --out scan.nxs
 """
 TRACK = "--effort 0.05 --pieces 1 --rounds 0 --no-intervals"
 SPHERES = """
@@ -145,6 +145,16 @@ PAGES: dict[str, Small] = {
         {"reconstruct": "--preset fast"},
     ),
     "cells.md": Small("", {"grow": "--cells 1 --box 16e-6 12e-6 12e-6 --snapshots 2 --frequency 3"}),
+    "forecast.md": Small(
+        f"""{FLOW.replace("--snapshots 4", "--snapshots 8")}
+        holosplat track scan.nxs --material haemoglobin {TRACK} --out run""",
+        {
+            "grow": "--cells 3 --box 30e-6 16e-6 16e-6 --snapshots 50 --frequency 3 --device cpu",
+            "train": "--steps 2 --device cpu",
+            "forecast": "--times 5",
+        },
+        "32e-6",
+    ),
     "four_beams.md": Small(BEAMS, FAST),
     "howto/bubbles.md": Small(
         f"{WATER} --detector 32 32 --out bubbles.nxs --truth truth.h5",

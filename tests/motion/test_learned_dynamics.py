@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -254,6 +255,16 @@ def test_noise_is_as_large_as_said_across_surfaces(series):
     assert float(across.square().mean().sqrt()) == pytest.approx(0.03, rel=1e-6)
     with pytest.raises(InputError, match=r"must hold folders of holosplat grow --compact, two at least"):
         FlowSeries.read(series / "flow1")
+
+
+def test_series_that_are_too_short_begin_no_training(series, tmp_path):
+    for name in ("a", "b"):
+        shutil.copytree(series / "flow1", tmp_path / "flows" / name)
+        for late in sorted((tmp_path / "flows" / name).glob("cells_*.npz"))[49:]:
+            late.unlink()
+    with pytest.raises(InputError, match="must have 50 snapshots at least, but it has 49"):
+        train_dynamics(tmp_path / "flows", tmp_path / "made", OPTIONS, False, lambda _: None, {})
+    assert not (tmp_path / "made").exists()
 
 
 def test_a_compact_series_is_what_meshes_say(tmp_path):

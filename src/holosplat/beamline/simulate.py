@@ -35,7 +35,7 @@ from .light import EVEN_LIGHT, UnevenLight
 SIMULATED_FRINGE_SAMPLES = 8
 """Samples on the first fringe in simulations: frames of the benchmark are then right to 1 % of their contrast (rms),
 most of them to half of that (docs/data/propagation.csv); faces exactly along the beam, where the phase jumps, to 1 to
-4 % (`_Sharp`)."""
+6 % (docs/data/faces.csv)."""
 MOST_PULSES = 10_000
 
 
@@ -129,10 +129,10 @@ class Simulation:
         return detect
 
 
-STEEP = 0.5
-"""Phase [rad] between neighbours from which on a sample is looked at more finely, and between finer ones from which on
-it is the mean of their waves. Faces along the beam part in two there; edges of cells are less steep, and means of what
-is smooth would lose light (docs/data/faces.csv)."""
+STEEP, ALONE = 0.5, 20.0
+"""A sample is the mean of the wave where the phase [rad] changes by so much between two finer ones, as at flat faces,
+which may part in two there. Finer ones are asked for where it changes by twice that across the sample, and so many
+times less beside: edges of round bodies change by a quarter there, and means of what is smooth would lose light."""
 FINER, TILE, TOGETHER = 8, 8, 256
 """Finer samples along a sample's edge, samples along the edge of a tile, and tiles that are projected at once."""
 
@@ -154,7 +154,7 @@ class _Sharp:
         lines = self._lines(views)
         k, (delta, beta) = wavenumber(self.exposures.energy_kev), self.exposures.refraction(1.0, 1.0)
         k_delta, (h, w) = float((k * delta)[0]), (min(TILE, n) for n in views.shape)
-        places = self._tiles(k_delta * lines[1, 0], h, w)
+        places = _tiles(_may_jump(k_delta * lines[1, 0]), h, w)
         for first in range(0, len(places), TOGETHER):
             some = places[first : first + TOGETHER]
             shifts = [views.cropped(slice(i, i + h), slice(j, j + w)).shifts for i, j in some]
@@ -173,18 +173,27 @@ class _Sharp:
         lines = LineIntegrals.of_any(self.obj.project(views))
         return torch.stack((lines[0], lines[1]))
 
-    @staticmethod
-    def _tiles(phase: torch.Tensor, h: int, w: int) -> list[tuple[int, int]]:
-        """First rows and columns of the tiles of h × w samples in which `phase` [H, W] rad is steep."""
-        rows, columns = (torch.nonzero(phase.diff(dim=axis).abs().cpu() > STEEP) for axis in (0, 1))
-        near = torch.cat([rows, rows + torch.tensor([1, 0]), columns, columns + torch.tensor([0, 1])])
-        last = torch.tensor([phase.shape[0] - h, phase.shape[1] - w])
-        found = torch.minimum(near // torch.tensor([h, w]) * torch.tensor([h, w]), last)
-        return [(int(row), int(column)) for row, column in found.unique(dim=0)]
-
     def voxelise(self, grid: Grid) -> Volume:
         """δ and β of the meshes."""
         return self.obj.voxelise(grid)
+
+
+def _may_jump(phase: torch.Tensor) -> torch.Tensor:
+    """[H, W] bool, the samples within which `phase` [H, W] rad may jump along an axis."""
+    found = torch.zeros_like(phase, dtype=torch.bool)
+    for axis in (0, 1):
+        padded = torch.nn.functional.pad(phase.movedim(axis, 1)[None], (2, 2), mode="replicate")[0]
+        first, second, third, fourth = padded.diff(dim=1).abs().unfold(1, 4, 1).unbind(-1)
+        across = second + third
+        found |= ((across > 2 * STEEP) & (across > ALONE * (first + fourth))).movedim(1, axis)
+    return found
+
+
+def _tiles(wanted: torch.Tensor, h: int, w: int) -> list[tuple[int, int]]:
+    """First rows and columns of the tiles of h × w samples that hold those that are `wanted` [H, W]."""
+    size, last = torch.tensor([h, w]), torch.tensor(wanted.shape) - torch.tensor([h, w])
+    found = torch.minimum(torch.nonzero(wanted.cpu()) // size * size, last)
+    return [(int(row), int(column)) for row, column in found.unique(dim=0)]
 
 
 def simulated_frames(obj: Object, exposures: Exposures, how: Simulation = Simulation()) -> Iterator[np.ndarray]:

@@ -120,7 +120,8 @@ class FlowSeries:
 def _series(folder: Path) -> Series:
     nodes, faces, times = read_compact(SeriesFolder(folder))
     with as_written(folder, "a series of holosplat grow --compact"):
-        require(len(times) >= min(WINDOWS) + HORIZONS, f"{folder} must have more snapshots than {len(times)}.")
+        least = max(WINDOWS) + max(ASKED) + 1
+        require(len(times) >= least, f"{folder} must have {least} snapshots at least, but it has {len(times)}.")
         order = np.argsort(nodes[0, :, :, 0].mean(1))
         return Series(torch.from_numpy(nodes[:, order]), torch.from_numpy(faces.astype(np.int64)), times)
 
@@ -315,7 +316,7 @@ def train_dynamics(
 ) -> tuple[Path, DynamicsValidation]:
     """Train on the series in `folder` into `out`; the weights' file, and the validation."""
     data = FlowSeries.read(folder, options.device)
-    training = (DynamicsTraining.resumed if resume else DynamicsTraining.begun)(data, out, options)  # pyright: ignore[reportArgumentType]
     told = DynamicsValidation(data.validation())
+    training = (DynamicsTraining.resumed if resume else DynamicsTraining.begun)(data, out, options)  # pyright: ignore[reportArgumentType]
     training.run(told, on_step)
     return training.finish(told, who), told
