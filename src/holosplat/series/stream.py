@@ -265,25 +265,12 @@ class Stream(threading.Thread):
         self, address: str, how: Streaming, reading: Reading, folder: Path, say: Callable[[str], None] = print
     ) -> None:
         super().__init__(daemon=True, name="stream")
-        zmq = _zmq()
+        _zmq()
         good = re.fullmatch(r"tcp://[^\s:/]+:\d{1,5}|tcp://\[[0-9a-fA-F:.]+\]:\d{1,5}", address) is not None
         require(good, f"a stream must be tcp://HOST:PORT, but it is {address}; correct the address.")
         self._reading, self._folder, self._say, self._how = reading, folder, say, how
         count, self._angles = views_of(reading)
         self._assembly = Assembly(count, lambda key: self._path(key).exists())
-        self._context = zmq.Context()
-        kinds = {"pull": zmq.PULL, "sub": zmq.SUB, "req": zmq.REQ}
-        self._socket = self._context.socket(kinds[how.socket])
-        self._socket.setsockopt(zmq.LINGER, 0)
-        self._socket.set_hwm(how.high_water)
-        self._socket.setsockopt(zmq.MAXMSGSIZE, int(1e6 * how.most_mb))
-        if how.socket == "sub":
-            self._socket.setsockopt(zmq.SUBSCRIBE, b"")
-        if how.socket == "req":  # a request whose answer is lost is made again
-            self._socket.setsockopt(zmq.REQ_RELAXED, 1)
-            self._socket.setsockopt(zmq.REQ_CORRELATE, 1)
-            self._socket.setsockopt(zmq.IMMEDIATE, 1)
-        self._events = self._socket.get_monitor_socket(zmq.EVENT_CONNECTED | zmq.EVENT_DISCONNECTED)
         self._address, self._ending = address, threading.Event()
         self.waiting = 0
         self._refused, self._told = Counter[str](), dict[str, float]()
@@ -294,12 +281,30 @@ class Stream(threading.Thread):
         if self.ident is not None:
             self.join()
         self._tell_all()
-        self._socket.disable_monitor()
-        self._context.destroy(linger=0)
 
     def run(self) -> None:
         """See `threading.Thread.run`."""
         zmq = _zmq()
+        self._context = zmq.Context()
+        kinds = {"pull": zmq.PULL, "sub": zmq.SUB, "req": zmq.REQ}
+        self._socket = self._context.socket(kinds[self._how.socket])
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.set_hwm(self._how.high_water)
+        self._socket.setsockopt(zmq.MAXMSGSIZE, int(1e6 * self._how.most_mb))
+        if self._how.socket == "sub":
+            self._socket.setsockopt(zmq.SUBSCRIBE, b"")
+        if self._how.socket == "req":  # a request whose answer is lost is made again
+            self._socket.setsockopt(zmq.REQ_RELAXED, 1)
+            self._socket.setsockopt(zmq.REQ_CORRELATE, 1)
+            self._socket.setsockopt(zmq.IMMEDIATE, 1)
+        self._events = self._socket.get_monitor_socket(zmq.EVENT_CONNECTED | zmq.EVENT_DISCONNECTED)
+        try:
+            self._receive(zmq)
+        finally:
+            self._socket.disable_monitor()
+            self._context.destroy(linger=0)
+
+    def _receive(self, zmq: Any) -> None:
         try:
             self._socket.connect(self._address)
         except zmq.ZMQError as error:
