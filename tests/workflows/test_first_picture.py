@@ -31,7 +31,7 @@ PRIORS = (MaterialPrior.known(CELL), MaterialPrior.of_ratio(CELL.delta / CELL.be
 def odd(rows: int = 51, columns: int = 67, pixel: float = 1e-6) -> tuple[Scan, float]:
     """A rectangular scan, and its total δ [m³]."""
     views = Views.evenly_spaced(6, (rows, columns), pixel)
-    cells = random_cells(2, (columns * pixel, rows * pixel, columns * pixel), 1, 15 * pixel)
+    cells = random_cells(2, (columns * pixel, rows * pixel, columns * pixel), 1, 0.3 * rows * pixel)
     scene = MeshScene.of_one_material(cells, CELL)
     scan = simulate(scene, Exposures.of(views, 20.0, 0.02), is_test=np.zeros(6, dtype=bool))
     volume = scene.voxelise(first_picture(scan, PRIORS[0]).grid)
