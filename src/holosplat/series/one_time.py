@@ -82,7 +82,7 @@ def reconstruct_time(
 
     A time that goes on from the one before is also begun by itself, if its last round still is of use, for then matter
     has changed much, or if it explains its frames surely less well than the last time that began by itself explains its
-    own. The better one is kept (`_better`). on_state: is told what `reconstruct` tells it. Ctrl-C is passed on. Errors:
+    own. The better one is kept (`_better`). on_state: as of `reconstruct`. Ctrl-C is passed on. Errors:
     `InputError` of `reconstruct`.
     """
     began, chosen = time.perf_counter(), folder.path / BEGUN

@@ -342,7 +342,7 @@ class Stream(threading.Thread):
         return came
 
     def take(self, parts: Sequence[bytes]) -> None:
-        """Take in a message; whatever is amiss in it is said."""
+        """Take in a message, or refuse it."""
         try:
             size = sum(map(len, parts))
             most = self._how.most_mb
