@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -269,7 +270,7 @@ def reconstruct_each(
 
 
 def watch(
-    folder: Positional[str],
+    folder: Positional[Path],
     out: Kept,
     how: Watching = Watching(),
     each: EachTime = EachTime(),
@@ -295,22 +296,23 @@ def watch(
     require(not matter.ranges(), "a watch needs one number for --delta-beta; find it by reconstruct of one scan.")
     require(reading.part.time_frame is None, "a watch takes all times of a scan; choose some with --time-frames.")
     settings = Act(each, method, illumination=illumination).settings(track=False, seed=seed)
-    from_socket, result = folder.startswith(SCHEME), WatchFolder(out)
-    source = result.path / RECEIVED if from_socket else Path(folder)
+    address = re.sub("^tcp:/+", SCHEME, str(folder))  # pathlib makes one slash of two
+    from_socket, result = address.startswith(SCHEME), WatchFolder(out)
+    source = result.path / RECEIVED if from_socket else folder
     stray = not from_socket and stream != Streaming()
     require(not stray, "--socket, --high-water, --most-waiting and --most-mb go with tcp://HOST:PORT; leave them.")
     feed, asked = None, reading.as_table()
     if from_socket:
-        feed, how = Stream(folder, stream, reading, source, say), replace(how, settle=0.0)
+        feed, how = Stream(address, stream, reading, source, say), replace(how, settle=0.0)
         told = replace(reading.told, sources=None, pulses=None)  # of messages; files have the views that are taken
         reading = replace(reading, told=told)
     said = {
-        "folder": folder if from_socket else str(source.resolve()),
+        "folder": address if from_socket else str(source.resolve()),
         "settings": to_table(settings.as_table()),
         "matter": asdict(matter),
         "reading": asked,
     }
-    say(f"watching {folder}; the page is {result.page}; Ctrl-C ends")
+    say(f"watching {address}; the page is {result.page}; Ctrl-C ends")
     with interruptible(lambda: f"ended; what {out} holds is whole, and the same command goes on from there"):
         watch = Watch(source, result, settings, matter.prior, reading, how, say, stream=feed)
         count = watch.run(said)
