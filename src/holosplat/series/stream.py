@@ -145,7 +145,8 @@ def _of_karabo(parts: Sequence[bytes], reading: Reading) -> list[Arrived]:
     from karabo_bridge import deserialize
 
     try:
-        data, meta = deserialize(list(parts))
+        found: Any = deserialize(list(parts))
+        data, meta = found
     except Exception as error:  # whatever a message that is none does to it
         said = f"{error!r:.80}"
         raise InputError(f"a message must be array-1.0 or of a Karabo bridge, but it is neither: {said}.") from None
@@ -160,7 +161,7 @@ def _of_karabo(parts: Sequence[bytes], reading: Reading) -> list[Arrived]:
         f"--sources must name one camera each of those with {PIXELS}, which are {', '.join(having) or 'none'}, but it "
         f"is {', '.join(wanted)}.",
     )
-    frames = [data[name][PIXELS] for name in names]
+    frames: list[Any] = [data[name][PIXELS] for name in names]
     alike = all(isinstance(one, np.ndarray) and one.dtype.name in TYPES and one.ndim in (2, 3) for one in frames)
     alike = alike and len({(one.shape, one.dtype) for one in frames}) == 1
     require(alike, f"{PIXELS} must be numbers [H, W] or [P, H, W], alike of all cameras, but they are not.")
