@@ -129,7 +129,8 @@ def test_few_blocks_of_the_guide_run_nowhere():
 
 def test_what_fails_is_seen(tmp_path):
     """In a shell at its first command and in a pipe, and in Python; what has an excuse is not run."""
-    for text in ("```sh\nfalse\ntrue\n```\n", "```sh\nfalse | cat\n```\n", "```python\nassert 0\n```\n"):
+    ours = "```sh\nholosplat info nowhere.nxs\n```\n"
+    for text in (ours, "```sh\nfalse\ntrue\n```\n", "```sh\nfalse | cat\n```\n", "```python\nassert 0\n```\n"):
         with pytest.raises(AssertionError):
             run(text, tmp_path)
     run("```sh\n# needs network: a file\nfalse\n```\n\n```\nfalse\n```\n", tmp_path)

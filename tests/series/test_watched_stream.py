@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import zmq
 from karabo_bridge import ServerInThread, serialize
 
 from helpers.cli import holosplat, refused
@@ -23,8 +24,6 @@ from holosplat.io.reading import Reading, Told
 from holosplat.series import stream as streaming
 from holosplat.series.stream import Arrived, Assembly, Stream, Streaming, parsed
 from holosplat.series.watch import Watch, WatchFolder, Watching
-
-zmq = pytest.importorskip("zmq")
 
 
 def message(train: int, frames: np.ndarray, **more: object) -> list[bytes]:
@@ -359,7 +358,7 @@ def test_what_a_stream_cannot_be(beams, tmp_path):
 
 
 def test_a_picture_of_the_time_in_work_is_on_the_page(files, beams, tmp_path, monkeypatch):
-    """Coarse at once, before the run has anything else; it is gone when the time is done."""
+    """Coarse at once, before the run has anything else; it is gone when the time is done. So for each scan."""
     import holosplat.series.watch as watching
 
     out, seen = tmp_path / "out", list[str]()
@@ -375,13 +374,15 @@ def test_a_picture_of_the_time_in_work_is_on_the_page(files, beams, tmp_path, mo
     monkeypatch.setattr(watching, "reconstruct_time", slow)
     incoming = tmp_path / "one"
     incoming.mkdir()
-    (incoming / "a.nxs").write_bytes((files.each / "scan9.nxs").read_bytes())
+    for name in ("a.nxs", "b.nxs"):
+        (incoming / name).write_bytes((files.each / "scan9.nxs").read_bytes())
     one = Watch(
-        incoming, WatchFolder(out), SETTINGS, known, Reading(), replace(Watching(), settle=0.0, poll=0.01, stop_after=1)
+        incoming, WatchFolder(out), SETTINGS, known, Reading(), replace(Watching(), settle=0.0, poll=0.01, stop_after=2)
     )
-    assert one.run({}) == 1
+    assert one.run({}) == 2
     assert "a.nxs, in work" in seen[0]
     assert "data:image/png" in seen[0]
+    assert any("b.nxs, in work" in page for page in seen)
     page = (out / "live.html").read_text()
     assert "in work" not in page
     assert page.count("data:image/png") >= 1
