@@ -22,6 +22,7 @@ from holosplat.methods import Auto, FitOptions, Gaussians, Method, solve
 from holosplat.methods.coarse import on_pixels
 from holosplat.methods.method import Task
 from holosplat.methods.volume import SmoothVolume
+from holosplat.optics.background import LightOptions
 from holosplat.representations import SurfaceMesh
 from holosplat.scan import Scan
 from holosplat.specimens.phantoms import unit_ball
@@ -36,6 +37,8 @@ START = HolographicTV(retrieval=5, iterations=10, corrections=1, inner=2, settli
 GAUSSIANS = Gaussians(volume=START, approximate_steps=3, fit=FitOptions(schedule=Schedule(steps=3)))
 AUTO = replace(Auto(gaussians=GAUSSIANS).with_effort(0.05), gaussians=GAUSSIANS)
 SMOOTH = SmoothVolume(volume=replace(START, upper=0.0), coarser=(), rounds=1, iterations=2)
+EVEN = LightOptions("even", still="none", noise="white")
+"""Told where light is not what a test is about: that it is decided on a GPU, a run in a folder holds."""
 
 
 @pytest.fixture
@@ -53,7 +56,7 @@ def frames(photons: float | None = None) -> Scan:
 
 def found(method: Method, scan: Scan) -> dict[str, np.ndarray]:
     """The parameters of what a method makes of the training frames, in main memory."""
-    result = solve(method, Task(scan.train(), KNOWN, 0))
+    result = solve(method, Task(scan.train(), KNOWN, 0, light=EVEN))
     return {name: value.detach().cpu().numpy() for name, value in result.parameters().items()}
 
 
@@ -76,7 +79,7 @@ def test_a_smooth_volume_is_that_of_the_cpu(monkeypatch):
 
 
 def test_what_a_fit_ends_with_stays_where_it_was(on_gpu):
-    result = solve(GAUSSIANS.on_backend("cuda"), Task(frames().train(), KNOWN, 0))
+    result = solve(GAUSSIANS.on_backend("cuda"), Task(frames().train(), KNOWN, 0, light=EVEN))
     assert result.backend == "cuda"
     assert all(isinstance(value, OnGpu) for value in result.parameters().values())
 
@@ -108,7 +111,7 @@ def test_a_run_goes_on_from_its_checkpoint(on_gpu, tmp_path):
 
 def test_a_run_that_finds_where_frames_are(on_gpu):
     refine = PoseOptions()
-    done = reconstruct(frames(), KNOWN, GAUSSIANS.on_backend("cuda"), matter="levels", refine=refine)
+    done = reconstruct(frames(), KNOWN, GAUSSIANS.on_backend("cuda"), matter="levels", light=EVEN, refine=refine)
     assert done.geometry is not None
 
 
