@@ -4,7 +4,8 @@ loaded PyTorch and the rest: importing takes longer than most of these commands.
     python forked.py SOCKET
 
 serves them; a script `holosplat` in a folder of PATH hands a command over (`served`). Streams, folder, environment and
-exit code are the caller's, and signals reach the command.
+exit code are the caller's, and signals reach the command. Torch takes one thread, as in other tests; with `UNDRAWN` in
+the environment, figures of reports are blank (`helpers.pictures`).
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ import subprocess
 import sys
 import tempfile
 import traceback
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 
 CALL = """#!{python} -IS
@@ -36,6 +37,9 @@ sys.exit(int(answer.readline() or 1))
 """
 
 
+Blank = Callable[[], AbstractContextManager[None]]
+
+
 @contextmanager
 def served() -> Iterator[Path]:
     """A folder for PATH with such a `holosplat`, as long as the context lasts."""
@@ -43,7 +47,9 @@ def served() -> Iterator[Path]:
         script, path = Path(folder) / "holosplat", os.path.join(folder, "socket")
         script.write_text(CALL.format(python=sys.executable, path=path), encoding="utf-8")
         script.chmod(0o755)
-        with subprocess.Popen([sys.executable, "-P", __file__, path], stdout=subprocess.PIPE, text=True) as server:
+        tests = {"PYTHONPATH": str(Path(__file__).parents[1])}
+        command = [sys.executable, "-P", __file__, path]
+        with subprocess.Popen(command, env=os.environ | tests, stdout=subprocess.PIPE, text=True) as server:
             assert server.stdout is not None
             assert server.stdout.readline() == "ready\n"
             yield Path(folder)
@@ -52,11 +58,16 @@ def served() -> Iterator[Path]:
 
 def serve(path: str) -> None:
     """Fork for each command that comes, until a signal ends it."""
+    import torch
+
     import holosplat.methods
     import holosplat.report
     import holosplat.workflows.reconstruct  # noqa: F401 - loaded for the commands
+    from helpers.pictures import undrawn
     from holosplat.cli import main
 
+    torch.set_num_threads(1)
+    os.fsync = os.fstat  # what commands write need not survive a power cut
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # children leave no trace
     with socket.socket(socket.AF_UNIX) as door:
         door.bind(path)
@@ -67,11 +78,11 @@ def serve(path: str) -> None:
             if os.fork() == 0:
                 door.close()
                 signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-                _command(caller, main)
+                _command(caller, main, undrawn)
             caller.close()
 
 
-def _command(caller: socket.socket, main: object) -> None:
+def _command(caller: socket.socket, main: Callable[[], None], undrawn: Blank) -> None:
     """Become the command of a caller, and tell it the exit code."""
     size, streams, *_ = socket.recv_fds(caller, 8, 3)
     words, folder, environment = json.loads(caller.recv(int.from_bytes(size, "big"), socket.MSG_WAITALL))
@@ -84,7 +95,8 @@ def _command(caller: socket.socket, main: object) -> None:
     os.environ.update(environment)
     sys.argv, code = ["holosplat", *words], 1
     try:
-        main()  # type: ignore[operator]
+        with undrawn() if environment.get("UNDRAWN") else nullcontext():
+            main()
         code = 0
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else int(end.code is not None)

@@ -80,8 +80,9 @@ def test_the_blocks_of_a_page_run(page, readme, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PAGES_SMALL)
-def test_blocks_that_take_long_run_at_a_small_size(name, tmp_path):
-    """With files that stand in for the reader's, and fewer pixels, views and steps."""
+def test_blocks_that_take_long_run_at_a_small_size(name, tmp_path, monkeypatch):
+    """With files that stand in for the reader's, fewer pixels, views and steps, and blank figures."""
+    monkeypatch.setenv("UNDRAWN", "1")
     small = PAGES_SMALL[name]
     shell = tmp_path / ".small.sh"
     shell.write_text(small.shell(), encoding="utf-8")
