@@ -1,4 +1,4 @@
-"""The frames of `simulate` are those of a second program that shares no code (`holosplat_bench/suite/multislice.py`)."""
+"""The frames of `simulate` are those of a second program of other code (`holosplat_bench/suite/multislice.py`)."""
 
 from __future__ import annotations
 

@@ -105,8 +105,8 @@ def read_history(folder: Path) -> list[Entry]:
 
 @dataclass(frozen=True)
 class Change:
-    """A number of a contestant, mean over the cases that both entries have, and its factor to the entry before (above 1:
-    worse; None: no entry before)."""
+    """A number of a contestant, mean over the cases that both entries have, and its factor to the entry before: above 1
+    is worse; None: no entry before."""
 
     track: str
     contestant: str

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from importlib import metadata
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,7 @@ from ..folder import BenchFolder, Row
 from .cases import SealedCase, prepare_case
 from .contest import TRACKS, WARM, Answer, Contestant, Outcome, Question, Track, compete
 from .entrants import BEST_PAIR, CONTESTANTS
+from .history import Entry
 
 Progress = Callable[[str, float], None]
 """A stage, and how much of it is done."""
@@ -103,6 +105,13 @@ def run_arena(
             folder.write_row(row)
             left -= 1
             on_row(row, left)
+
+
+def entry_of(arena: Arena, folder: ArenaFolder) -> Entry:
+    """The time line's entry of all rows of `folder` of this seed; versions: of the peers that are installed."""
+    peers = {c.distribution for c in arena.entered if not c.ours}
+    versions = {name: metadata.version(name) for name in sorted(peers)}
+    return Entry.of([row for row in folder.read_rows() if row.seed == arena.seed], arena.size, arena.absent, versions)
 
 
 def row_name(contestant: Contestant) -> str:
