@@ -1,4 +1,4 @@
-"""What holosplat does in the arena, as acts: `Question` in, and a function that computes the answer."""
+"""What holosplat does in the arena, as acts; each imports what it needs inside, in a process of its own."""
 
 from __future__ import annotations
 
@@ -7,17 +7,10 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from holosplat.baselines import TOMOGRAPHIES
 from holosplat.geometry import Grid, Views
 from holosplat.matter import MaterialPrior, Matter
-from holosplat.methods import METHODS, Method
-from holosplat.model import Instrument
-from holosplat.optics.retrieval import RETRIEVALS
-from holosplat.projectors.voxels import SliceProjector
-from holosplat.representations import VoxelGrid
 from holosplat.scan import Exposures, Scan
 from holosplat.units import wavenumber
-from holosplat.workflows.reconstruct import reconstruct
 
 from .contest import Answer, Question
 
@@ -39,6 +32,8 @@ def radian(question: Question) -> float:
 
 def slices(question: Question) -> Callable[[], Answer]:
     """Kernels: the slice matrices of tomography; strips, exact for square voxels."""
+    from holosplat.projectors.voxels import SliceProjector
+
     views = views_of(question)
     projector = SliceProjector(Grid.of_views(views), views)
     volume, lines = (torch.from_numpy(a).float() for a in (question.volume, question.lines))
@@ -53,6 +48,9 @@ def slices(question: Question) -> Callable[[], Answer]:
 
 def step(question: Question) -> Callable[[], Answer]:
     """Steps: voxels through the waves, by the compiled kernels and their adjoints."""
+    from holosplat.model import Instrument
+    from holosplat.representations import VoxelGrid
+
     exposures = exposures_of(question)
     instrument, grid, delta = Instrument(exposures), Grid.of_views(exposures.views), radian(question)
     matter, frames = Matter.one(delta, delta / question.ratio), torch.from_numpy(question.frames).float()
@@ -68,6 +66,8 @@ def step(question: Question) -> Callable[[], Answer]:
 
 
 def _retrieval(name: str, question: Question) -> Callable[[], Answer]:
+    from holosplat.optics.retrieval import RETRIEVALS
+
     exposures, frames, delta = exposures_of(question), torch.from_numpy(question.frames), radian(question)
 
     def run() -> Answer:
@@ -88,6 +88,8 @@ def tikhonov(question: Question) -> Callable[[], Answer]:
 
 
 def _tomography(name: str, question: Question) -> Callable[[], Answer]:
+    from holosplat.baselines import TOMOGRAPHIES
+
     views = views_of(question)
     grid, lines = Grid.of_views(views), torch.from_numpy(question.lines).float() * question.pixel
 
@@ -112,13 +114,16 @@ def total_variation(question: Question) -> Callable[[], Answer]:
     return _tomography("tv", question)
 
 
-def _job(method: Method | None, question: Question) -> Callable[[], Answer]:
+def _job(question: Question, method: str) -> Callable[[], Answer]:
+    from holosplat.methods import METHODS
+    from holosplat.workflows.reconstruct import reconstruct
+
     exposures = exposures_of(question)
     scan = Scan(question.frames.astype(np.float32), exposures, np.zeros(len(exposures), dtype=bool))
     prior, grid = MaterialPrior.of_ratio(question.ratio), Grid.of_views(exposures.views)
 
     def run() -> Answer:
-        found = (reconstruct(scan, prior) if method is None else reconstruct(scan, prior, method)).object
+        found = reconstruct(scan, prior, METHODS[method]).object
         volume = found.voxelise(grid)
         return {"volume": volume.delta / radian(question), "beta": volume.beta}
 
@@ -127,9 +132,9 @@ def _job(method: Method | None, question: Question) -> Callable[[], Answer]:
 
 def default(question: Question) -> Callable[[], Answer]:
     """Jobs: what `holosplat reconstruct` does by itself."""
-    return _job(None, question)
+    return _job(question, "auto")
 
 
 def two_steps(question: Question) -> Callable[[], Answer]:
     """Jobs: nonlinear Tikhonov retrieval of each view, then total variation."""
-    return _job(METHODS["tikhonov-tv"], question)
+    return _job(question, "tikhonov-tv")

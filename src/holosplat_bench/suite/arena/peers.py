@@ -222,6 +222,7 @@ def scico_step(question: Question) -> Callable[[], Answer]:
     from scico.linop.optics import FresnelPropagator  # pyright: ignore[reportMissingImports]
 
     jax, project = _scico(question)
+    jax.config.update("jax_enable_x64", True)  # its kernel's phase kz of 1e10 rad would lose all digits otherwise
     jnp, k = jax.numpy, wavenumber(question.energy_kev)
     shape = question.frames.shape[1:]
     waves = FresnelPropagator(shape, question.pixel, k, question.distance, pad_factor=2)
