@@ -21,14 +21,14 @@ from holosplat_bench.suite.families import SIMULATED
 from holosplat_bench.suite.folder import Row
 from holosplat_bench.suite.pages.arena import front, overall, write_arena
 
-SIDE, SEED = 16, 11
+SIDE, SEED, NAME = 16, 11, "few-photons"
 ACTS = "helpers.arena_peers"
 
 
 @pytest.fixture(scope="module")
 def case(tmp_path_factory) -> SealedCase:
-    """One ball, on few pixels."""
-    return prepare_case("round-cell", SEED, SIDE, tmp_path_factory.mktemp("case"))
+    """Up to three balls, on few pixels."""
+    return prepare_case(NAME, SEED, SIDE, tmp_path_factory.mktemp("case"))
 
 
 def question(seed: int = 0) -> Question:
@@ -113,16 +113,16 @@ def misfit(asked: Question) -> float:
 def test_every_case_is_of_a_family_and_sealed_by_its_seed(case, tmp_path):
     assert len(FAMILIES) == 12
     assert set(FAMILIES.values()) <= set(SIMULATED)
-    again, other = (prepare_case("round-cell", seed, SIDE, tmp_path / str(seed)) for seed in (SEED, SEED + 1))
+    again, other = (prepare_case(NAME, seed, SIDE, tmp_path / str(seed)) for seed in (SEED, SEED + 1))
     assert np.array_equal(again.scan.frames, case.scan.frames)
     assert not np.array_equal(other.scan.frames, case.scan.frames)
     assert case.scan.is_test.sum() == 2
     found = forward(arena_run._Judge.of(case).question("steps"), arena_run._Judge.of(case)._radians())
-    assert np.linalg.norm(found - case.lines) < 0.02 * np.linalg.norm(case.lines)  # truth and true lines are of one
+    assert np.linalg.norm(found - case.lines) < 0.1 * np.linalg.norm(case.lines)  # one scene, on few voxels
     with pytest.raises(hs.InputError, match="another size or seed"):
-        prepare_case("round-cell", SEED, 2 * SIDE, tmp_path / str(SEED))
+        prepare_case(NAME, SEED, 2 * SIDE, tmp_path / str(SEED))
     with pytest.raises(hs.InputError, match="size must"):
-        prepare_case("round-cell", SEED, 4, tmp_path / "small")
+        prepare_case(NAME, SEED, 4, tmp_path / "small")
 
 
 # --- the run and its page -------------------------------------------------------------------------------------
@@ -132,10 +132,12 @@ def test_every_case_is_of_a_family_and_sealed_by_its_seed(case, tmp_path):
 def arena() -> Arena:
     rows = [peer("right", "right"), peer("crash", "crash"), peer("slow", "slow"), peer("shape", "other_shape")]
     rows += [peer("nan", "not_finite"), peer("elsewhere", "right", distribution="no-such-distribution")]
-    return Arena(["round-cell"], ["retrieval"], SEED, SIDE, 20.0, tuple(rows))
+    return Arena([NAME], ["retrieval"], SEED, SIDE, 20.0, tuple(rows))
 
 
-def test_a_run_goes_on_past_its_peers_and_keeps_rows(arena, tmp_path, monkeypatch):
+def test_a_run_goes_on_past_its_peers_and_keeps_rows(arena, case, tmp_path, monkeypatch):
+    np.save(tmp_path / "lines.npy", case.lines)
+    monkeypatch.setenv("ARENA_LINES", str(tmp_path / "lines.npy"))
     limits = {"slow": 2.0}
     real = compete
     monkeypatch.setattr(
@@ -158,7 +160,7 @@ def test_a_run_goes_on_past_its_peers_and_keeps_rows(arena, tmp_path, monkeypatc
     assert entry.absent == ["no-such-distribution"]
     html, markdown = write_arena(entry, [], folder.path)
     text = html.read_text(encoding="utf-8")
-    for words in ("Not installed: no-such-distribution", "crash: no result on round-cell: ended by signal SIGKILL"):
+    for words in ("Not installed: no-such-distribution", "crash: no result on few-photons: ended by signal SIGKILL"):
         assert words in text
         assert words.split(":")[0] in markdown.read_text(encoding="utf-8")
     assert 'src="data:image' in text
@@ -223,17 +225,17 @@ def test_less_dice_is_worse_and_only_shared_cases_count():
 
 
 def test_entries_are_compared_on_one_machine_and_red_on_the_page(tmp_path):
-    line = [entry("2026-01", "aaa", holosplat=(0.1, 1.0)), entry("2026-02", "bbb", "two", holosplat=(0.2, 9.0))]
+    line = [entry("2026-01", "aaa", holosplat=(0.1, 1.0)), entry("2026-02", "other7", "two", holosplat=(0.2, 9.0))]
     now = entry("2026-03", "ccc", holosplat=(0.11, 1.0))
     for one in (*line, now):
         one.write(tmp_path / one.file)
     history = read_history(tmp_path)
-    assert [one.commit for one in history] == ["aaa", "bbb", "ccc"]
+    assert [one.commit for one in history] == ["aaa", "other7", "ccc"]
     assert previous(now, history) == line[0]
     html, _ = write_arena(now, history, tmp_path)
     text = html.read_text(encoding="utf-8")
     assert '<span class="worse">0.11 (worse by 10 %)</span>' in text
-    assert "bbb" not in text
+    assert "other7" not in text
     (tmp_path / "other.json").write_text("{}")
     with pytest.raises(hs.InputError, match="must be an entry"):
         read_history(tmp_path)

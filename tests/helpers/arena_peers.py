@@ -31,17 +31,8 @@ def busy(question: Question) -> Callable[[], Answer]:
 
 
 def right(question: Question) -> Callable[[], Answer]:
-    """The true phase, which it finds where the test's case lies."""
-    from holosplat_bench.suite.arena.cases import prepare_case
-
-    def run() -> Answer:
-        import tempfile
-        from pathlib import Path
-
-        with tempfile.TemporaryDirectory() as folder:
-            return {"lines": prepare_case("round-cell", 11, question.frames.shape[1], Path(folder)).lines}
-
-    return run
+    """The true phase, from the file that the test names."""
+    return lambda: {"lines": np.load(os.environ["ARENA_LINES"])}
 
 
 def crash(question: Question) -> Callable[[], Answer]:

@@ -184,7 +184,7 @@ def mbirjax_volume(question: Question) -> Callable[[], Answer]:
 FINER = 2
 """Pixels of SCICO's projector along a voxel: its shadow must not be wider than a pixel of the detector."""
 TV_WEIGHT = 0.01
-"""Weight of the total variation beside half the squared misfit [rad]: of the order of errors of the phase; not tuned."""
+"""Weight of the total variation beside half the squared misfit [rad]: of the order of errors of a phase; untuned."""
 ADMM_STEPS = 40
 """Iterations of ADMM with five of conjugate gradients in each, as in SCICO's examples of tomography."""
 RHO = 1.0

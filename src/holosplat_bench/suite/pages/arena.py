@@ -108,7 +108,8 @@ def _said(entry: Entry) -> str:
     return text
 
 
-def _text(number: str, value: float | None) -> str:
+def shown(number: str, value: float | None) -> str:
+    """A number as tables show it; a dash where there is none."""
     if value is None:
         return "–"
     return f"{value:.3f}" if number in ("dice", "ssim") else f"{value:.3g}"
@@ -118,7 +119,7 @@ def _table(track: str, table: dict[str, dict[str, float]], said: dict[str, str],
     best, rows = front(table), []
     for name, words in said.items():
         numbers = table.get(name, {})
-        cells = [Cell(_text(n, numbers.get(n))) for n in (*MEASURES[track], "seconds", "memory")]
+        cells = [Cell(shown(n, numbers.get(n))) for n in (*MEASURES[track], "seconds", "memory")]
         rows.append((Cell(name), *cells, Cell("on it" if name in best else "", name in best), Cell(words)))
     heads = [CALLED.get((track, n)) or CALLED[n] for n in MEASURES[track]]
     head = ("contestant", *heads, CALLED["seconds"], "memory (MB)", "Pareto front", "what it is")
@@ -193,10 +194,10 @@ def _time_line(entry: Entry, history: Sequence[Entry]) -> Sheet:
 def _change(change: Change | None) -> Cell:
     if change is None:
         return Cell("–")
-    text = _text(change.number, change.value)
+    said = shown(change.number, change.value)
     if change.worse and change.factor is not None:
-        return Cell(f"{text} (worse by {100 * (change.factor - 1):.0f} %)", worse=True)
-    return Cell(text)
+        return Cell(f"{said} (worse by {100 * (change.factor - 1):.0f} %)", worse=True)
+    return Cell(said)
 
 
 def _record(entry: Entry) -> ScoreTable:
