@@ -166,14 +166,24 @@ def report(folder: Positional[Path] = Path("bench")) -> None:
         _say(f"wrote {path}")
 
 
+@dataclass(frozen=True)
+class Draw:
+    """How sealed cases are drawn, and how long contestants may take."""
+
+    seed: Seed = FIRST_SEED
+    """Seed from which matter, geometry and noise are drawn; options were tuned on seeds below 100."""
+    size: int = 48
+    """Pixels along an edge of frames and volumes: bodies are resolved, and all takes an hour."""
+    limit: float = 300.0
+    """Wall time after which a contestant is stopped [s]: many times what any takes on such cases."""
+
+
 def arena(
     cases: tuple[str, ...] = (),
     tracks: tuple[str, ...] = (),
-    seed: Seed = FIRST_SEED,
-    size: int = 48,
     out: Kept = Path("arena"),
     history: Path | None = None,
-    limit: float = 300.0,
+    draw: Draw = Draw(),
     retry: bool = False,
     list_only: Annotated[bool, arg(name="list")] = False,
 ) -> None:
@@ -184,11 +194,8 @@ def arena(
     Args:
         cases: Names of sealed cases (default: all twelve).
         tracks: Kinds of contests: kernels, steps, retrieval, tomography, jobs (default: all).
-        seed: Seed from which matter, geometry and noise are drawn; options were tuned on seeds below 100.
-        size: Pixels along an edge of frames and volumes.
         out: Folder of the arena, new or to go on with; arena.html and entry.json are written there.
         history: Folder of the time line, such as docs/data/arena: earlier entries are compared, and this one is added.
-        limit: Wall time after which a contestant is stopped [s].
         retry: Run again what failed.
         list_only: Only list cases, tracks and contestants.
     """
@@ -199,7 +206,7 @@ def arena(
     from ..suite.arena.run import Arena, ArenaFolder, chosen_tracks, entry_of, run_arena
     from ..suite.run import chosen
 
-    made = Arena(chosen("--cases", cases, list(FAMILIES)), chosen_tracks(tracks), seed, size, limit)
+    made = Arena(chosen("--cases", cases, list(FAMILIES)), chosen_tracks(tracks), draw.seed, draw.size, draw.limit)
     if list_only:
         print("cases:", *made.cases, sep="\n  ")
         for one in CONTESTANTS:

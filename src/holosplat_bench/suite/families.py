@@ -8,16 +8,19 @@ from functools import partial
 
 import numpy as np
 
-import holosplat as hs
-from holosplat.beamline.declared.specimens import Continuous, RedCells, Specimen
+from holosplat.beamline.declared.specimens import Continuous, Meshed, RedCells, Specimen
 from holosplat.beamline.light import UnevenLight
+from holosplat.beamline.simulate import simulate
+from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
+from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.metrics import volume_scores
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.continuous import Bump, ContinuousScene, Element, Soft, ellipsoid
 from holosplat.specimens.phantoms import packed_balls
 from holosplat.specimens.scene import MeshScene
 from holosplat.units import wavelength, wavenumber
+from holosplat.workflows.reconstruct import Reconstruction
 
 from .random_specimens import KINDS, Draw, Room
 
@@ -26,9 +29,9 @@ REFERENCE = 1e-7
 """δ with which a scene is made first, to see how thick it is."""
 TRIALS = 50
 """Draws of matter of which one must find its place."""
-Matter = Callable[[hs.DeltaBeta], MeshScene | ContinuousScene]
+Matter = Callable[[DeltaBeta], MeshScene | ContinuousScene]
 """The matter of a draw, of any δ and β."""
-Judge = Callable[[hs.workflows.Reconstruction], float]
+Judge = Callable[[Reconstruction], float]
 """The error of what a run made."""
 
 
@@ -38,7 +41,7 @@ class Scene:
     matter: of a simulated scene."""
 
     scan: Scan
-    prior: hs.MaterialPrior
+    prior: MaterialPrior
     error: Judge
     facts: str
     matter: MeshScene | ContinuousScene | None = None
@@ -71,21 +74,21 @@ class Family:
             Views.from_angles(angles, (rows, columns), PIXEL), ENERGY, distance, float(rng.choice([0, 0, 0.5]))
         )
         matter = self.placed(rng, room)
-        thin = hs.DeltaBeta(REFERENCE, REFERENCE / ratio)
+        thin = DeltaBeta(REFERENCE, REFERENCE / ratio)
         lines = matter(thin).project(exposures.views[[0]])[1]
-        material = hs.DeltaBeta(*(x * phase / (wavenumber(ENERGY) * float(lines.max())) for x in thin))
+        material = DeltaBeta(*(x * phase / (wavenumber(ENERGY) * float(lines.max())) for x in thin))
         truth = matter(material)
         photons = None if self.photons is None or rng.random() < 0.2 else log_uniform(rng, *self.photons)
         light = self.light(rng)
         if self.flux and rng.random() < 0.4:
             light = {"light_offset": rng.uniform(0.001, 0.005)} | light
         pattern = 1 + self.pattern * rng.uniform(0.3, 1) * rng.normal(size=(rows, columns))
-        clean = hs.simulate(truth, exposures, is_test=is_test).frames * pattern
+        clean = simulate(truth, exposures, is_test=is_test).frames * pattern
         lamp, draw = UnevenLight(**light, light_seed=seed).on(count, (rows, columns)), np.random.default_rng(seed)
         frames = np.stack([lamp.recorded(one, n, photons, draw) for n, one in enumerate(clean)])
         told, grid = str(rng.choice(self.told)), Grid.of_views(exposures.views)
-        known = {"known": hs.MaterialPrior.known(material), "ratio": hs.MaterialPrior.of_ratio(ratio)}
-        prior, true = known.get(told, hs.MaterialPrior.unknown()), truth.voxelise(grid)
+        known = {"known": MaterialPrior.known(material), "ratio": MaterialPrior.of_ratio(ratio)}
+        prior, true = known.get(told, MaterialPrior.unknown()), truth.voxelise(grid)
         facts = f"{matter.args[0].kind}, " if isinstance(matter, partial) else ""
         facts += f"Fresnel number {fresnel:.2f}, {phase:.2f} rad, {told_photons(photons)}, {told} told"
         facts += "".join(f", {key.removeprefix('light_')} {value:.2g}" for key, value in light.items())
@@ -99,21 +102,24 @@ class Family:
         )
 
     def placed(self, rng: Draw, room: Room) -> Matter:
+        """The matter of the first draw that finds its place; `InputError` where none of `TRIALS` does."""
         for _ in range(TRIALS):
             matter = self.matter(rng, room)
             try:
-                matter(hs.DeltaBeta(REFERENCE, REFERENCE))
-            except hs.InputError:  # no place for so many bodies
+                matter(DeltaBeta(REFERENCE, REFERENCE))
+            except InputError:  # no place for so many bodies
                 continue
             return matter
-        raise hs.InputError(f"a family must have room for its bodies, but none of {TRIALS} draws has; make it larger.")
+        raise InputError(f"a family must have room for its bodies, but none of {TRIALS} draws has; make it larger.")
 
 
 def log_uniform(rng: Draw, least: float, most: float) -> float:
+    """A number between two, evenly in the logarithm."""
     return float(np.exp(rng.uniform(np.log(least), np.log(most))))
 
 
 def told_photons(photons: float | None) -> str:
+    """Photons a pixel in words; None: no noise."""
     return "no photon noise" if photons is None else f"{photons:.0f} photons"
 
 
@@ -126,7 +132,7 @@ def drawn(kind: str) -> Callable[[Draw, Room], Matter]:
         more = rng.uniform(*((2, 5) if kind == "absorber" else (0.3, 0.8)))
         darker = rng.uniform(*((20, 80) if kind == "absorber" else (0.2, 1.0)))
         second = kind in ("coated", "absorber")
-        filling = (lambda m: hs.DeltaBeta(m.delta * more, m.beta * darker)) if second else None
+        filling = (lambda m: DeltaBeta(m.delta * more, m.beta * darker)) if second else None
         return partial(_filled, specimen, seed, filling)
 
     return draw
@@ -135,13 +141,14 @@ def drawn(kind: str) -> Callable[[Draw, Room], Matter]:
 def _filled(
     specimen: Specimen,
     seed: int,
-    filling: Callable[[hs.DeltaBeta], hs.DeltaBeta] | None,
-    material: hs.DeltaBeta,
+    filling: Callable[[DeltaBeta], DeltaBeta] | None,
+    material: DeltaBeta,
 ) -> MeshScene | ContinuousScene:
     if isinstance(specimen, Continuous):
         return specimen.continuous(seed, [material, *([filling(material)] if filling else [])])[0]
+    assert isinstance(specimen, Meshed)
     made = specimen.bodies(seed, None)
-    empty = hs.DeltaBeta(-material.delta, -material.beta)
+    empty = DeltaBeta(-material.delta, -material.beta)
     materials = [material] * len(made.outer) + [empty] * len(made.cores)
     return MeshScene((*made.outer, *made.cores), tuple(materials))
 
@@ -151,10 +158,10 @@ Part = tuple[np.ndarray, np.ndarray, Soft | Bump, float, np.ndarray | None]
 
 
 def _of_parts(parts: list[Part]) -> Matter:
-    def made(material: hs.DeltaBeta) -> ContinuousScene:
+    def made(material: DeltaBeta) -> ContinuousScene:
         elements: list[Element] = []
         for centre, semi, profile, level, turn in parts:
-            matter = hs.DeltaBeta(level * material.delta, level * material.beta)
+            matter = DeltaBeta(level * material.delta, level * material.beta)
             elements.append(ellipsoid(centre, semi, profile, matter, turn))
         return ContinuousScene(tuple(elements))
 

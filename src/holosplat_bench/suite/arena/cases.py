@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 from scipy import fft
 
-import holosplat as hs
 from holosplat.checks import in_range, require
 from holosplat.geometry import Grid, Views
 from holosplat.io.atomic import atomic_path
@@ -17,6 +16,7 @@ from holosplat.io.guard import read_archive
 from holosplat.io.json import read_json, write_json
 from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.io.volumes import read_volume, write_volume
+from holosplat.matter import DeltaBeta
 from holosplat.optics.detector import bin_pixels
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.continuous import ContinuousScene
@@ -115,9 +115,9 @@ def _draw(name: str, seed: int, size: int) -> SealedCase:
     exposures = Exposures.of(views, ENERGY, PIXEL**2 / wavelength(ENERGY) / fresnel)
     edge = 0.9 * PIXEL * size
     matter = family.placed(rng, Room(rng.uniform(0.2, 0.4) * PIXEL * size, edge, edge, edge))
-    k, thin = wavenumber(ENERGY), hs.DeltaBeta(REFERENCE, REFERENCE / ratio)
+    k, thin = wavenumber(ENERGY), DeltaBeta(REFERENCE, REFERENCE / ratio)
     thickest = max(float(matter(thin).project(views[[n]])[1].max()) for n in range(len(views)))
-    scene = matter(hs.DeltaBeta(*(x * phase / (k * thickest) for x in thin)))
+    scene = matter(DeltaBeta(*(x * phase / (k * thickest) for x in thin)))
     frames = np.stack([multislice_frames(scene, exposures[[n]], (SLABS,))[0] for n in range(len(views))])
     is_test = np.arange(len(views)) >= VIEWS
     frames[:VIEWS] = rng.poisson(photons * np.maximum(frames[:VIEWS], 0)) / photons
@@ -154,8 +154,8 @@ def multislice_matter(
 ) -> multislice.Matter:
     """A scene as the other program sees it."""
     if isinstance(scene, MeshScene):
-        pairs = zip(scene.meshes, scene.materials)
-        return multislice.Surfaces.of(((m.vertices, m.faces, *of) for m, of in pairs), rotation, on)
+        bodies = [(m.vertices, m.faces, of.delta, of.beta) for m, of in zip(scene.meshes, scene.materials)]
+        return multislice.Surfaces.of(bodies, rotation, on)
     return multislice.Ellipsoids.of(scene.elements, rotation, on)
 
 
@@ -168,6 +168,6 @@ def multislice_frames(
     radius = float(np.linalg.norm(scene.bounds, axis=1).max())
     made = []
     for count in counts:
-        wave = multislice.behind(met, np.linspace(-radius, radius, count + 1), energy, on)
+        wave = multislice.behind(met, np.linspace(-radius, radius, count + 1).tolist(), energy, on)
         made.append(multislice.frame(wave, float(taken.distance[0]), energy, float(taken.psf_sigma_px[0]), on))
     return made

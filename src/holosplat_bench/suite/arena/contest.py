@@ -62,9 +62,9 @@ class Question:
     def read(cls, path: Path) -> Question:
         """Those that `write` wrote."""
         held = read_archive(path, what="a question of the arena")
-        numbers = {name: float(held[name]) for name in ("pixel", "energy_kev", "distance", "ratio")}
-        arrays = {name: held[name] for name in ("frames", "angles", "lines", "volume")}
-        return cls(**arrays, **numbers, pair=tuple(str(act) for act in held["pair"]))
+        pixel, energy, distance, ratio = (float(held[n]) for n in ("pixel", "energy_kev", "distance", "ratio"))
+        pair = tuple(str(act) for act in held["pair"])
+        return cls(held["frames"], held["angles"], pixel, energy, distance, ratio, held["lines"], held["volume"], pair)
 
 
 Answer = dict[str, np.ndarray]

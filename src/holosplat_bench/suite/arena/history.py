@@ -28,7 +28,8 @@ Numbers = Mapping[str, float | None]
 @dataclass(frozen=True)
 class Entry:
     """commit, when (UTC), machine, versions: of the run; seed, size: of its cases; absent: what was not installed;
-    rows: a dictionary of track, case, contestant, status, reason, numbers, seconds and memory_bytes each."""
+    rows: a dictionary of track, case, contestant, status, reason, numbers, seconds,
+    memory_bytes and commit each."""
 
     commit: str
     when: str
@@ -55,6 +56,7 @@ class Entry:
                 "numbers": {name: json_number(value) for name, value in row.test.items()},
                 "seconds": row.seconds,
                 "memory_bytes": row.memory_bytes,
+                "commit": row.commit,
             }
             for row in rows
         ]

@@ -199,11 +199,11 @@ def _scico(question: Question) -> tuple[Any, Callable[[Any], Any]]:
 
     side = question.volume.shape[0]
     shape, pitch = (FINER * side,) * 2, (1 / FINER,) * 2
-    slices = XRayTransform2D(shape, jnp.asarray(question.angles), dx=pitch, det_count=side)
+    slices = XRayTransform2D(shape, jnp.asarray(question.angles), dx=jnp.asarray(pitch), det_count=side)
 
     def project(volume: Any) -> Any:
         fine = jnp.repeat(jnp.repeat(volume.transpose(1, 2, 0), FINER, 1), FINER, 2) / FINER**2
-        return jax.vmap(slices.project if hasattr(slices, "project") else slices, out_axes=1)(fine)
+        return jax.vmap(slices.project, out_axes=1)(fine)
 
     return jax, project
 
@@ -224,14 +224,16 @@ def scico_step(question: Question) -> Callable[[], Answer]:
     jax, project = _scico(question)
     jax.config.update("jax_enable_x64", True)  # its kernel's phase kz of 1e10 rad would lose all digits otherwise
     jnp, k = jax.numpy, wavenumber(question.energy_kev)
-    shape = question.frames.shape[1:]
-    waves = FresnelPropagator(shape, question.pixel, k, question.distance, pad_factor=2)
+    rows, columns = question.frames.shape[1:]  # padded here: scico 0.0.7 with pad_factor crops spectra, not waves
+    waves = FresnelPropagator((2 * rows, 2 * columns), question.pixel, k, question.distance)
     frames, start = (jnp.asarray(a, dtype=np.float32) for a in (question.frames, question.volume))
 
     def misfit(volume: Any) -> Any:
         behind = jnp.exp(-(1 / question.ratio + 1j) * project(volume)) - 1
         turned = np.exp(-1j * (k * question.distance % (2 * np.pi)))  # without the constant exp(ikz)
-        shown = jnp.stack([jnp.abs(turned * waves(one) + 1) ** 2 for one in behind])
+        padded = jnp.pad(behind, ((0, 0), (0, rows), (0, columns)))
+        seen = jnp.stack([waves(one)[:rows, :columns] for one in padded])
+        shown = jnp.abs(turned * seen + 1) ** 2
         return 0.5 * jnp.sum((shown - frames) ** 2)
 
     gradient = jax.jit(jax.grad(misfit))
@@ -279,8 +281,9 @@ class _Rtk:
     """Images and the geometry of parallel beams, which is a source at no distance from the detector."""
 
     def __init__(self, question: Question) -> None:
-        import itk  # pyright: ignore[reportMissingImports]
+        import itk as whole  # pyright: ignore[reportMissingImports]
 
+        itk: Any = whole  # its parts are loaded when they are named
         self.itk, self.rtk = itk, itk.RTK
         itk.MultiThreaderBase.SetGlobalDefaultNumberOfThreads(1)
         self.kind = itk.Image[itk.F, 3]

@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from holosplat.report.page import Headline
 from holosplat.report.style import CYCLE, FAINT, WIDTH, letter, new_figure, styled
 
-from ..arena.contest import TRACKS
+from ..arena.contest import TRACKS, Track
 from ..arena.history import Change, Entry, changes, mean, previous
 from .page import Entry as Cell
 from .page import Page, Picture, ScoreTable, Sheet, write_page
@@ -126,7 +126,7 @@ def _table(track: str, table: dict[str, dict[str, float]], said: dict[str, str],
     return ScoreTable(head, rows, caption)
 
 
-def _track(entry: Entry, track: str, images: Path) -> Sheet:
+def _track(entry: Entry, track: Track, images: Path) -> Sheet:
     table, rows = overall(entry, track), [row for row in entry.rows if row["track"] == track]
     for name in table:
         memory = [row["memory_bytes"] for row in rows if row["contestant"] == name and row["memory_bytes"]]
