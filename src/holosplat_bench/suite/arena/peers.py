@@ -232,7 +232,7 @@ def scico_step(question: Question) -> Callable[[], Answer]:
         behind = jnp.exp(-(1 / question.ratio + 1j) * project(volume)) - 1
         turned = np.exp(-1j * (k * question.distance % (2 * np.pi)))  # without the constant exp(ikz)
         padded = jnp.pad(behind, ((0, 0), (0, rows), (0, columns)))
-        seen = jnp.stack([waves(one)[:rows, :columns] for one in padded])
+        seen = jnp.stack([jnp.asarray(waves(one)) for one in padded])[:, :rows, :columns]
         shown = jnp.abs(turned * seen + 1) ** 2
         return 0.5 * jnp.sum((shown - frames) ** 2)
 

@@ -61,8 +61,8 @@ def write_arena(entry: Entry, history: Sequence[Entry], folder: Path) -> tuple[P
     """Write arena.html (self-contained) and arena.md with pictures in `folder`/report; returns both pages' paths."""
     images = folder / "report"
     images.mkdir(exist_ok=True)
-    tracks = [track for track in TRACKS if any(row["track"] == track for row in entry.rows)]
-    sheets = [_time_line(entry, history), *(_track(entry, track, images) for track in tracks)]
+    tracks: list[Track] = [track for track in TRACKS if any(row["track"] == track for row in entry.rows)]
+    sheets = [*(_track(entry, track, images) for track in tracks), _time_line(entry, history)]
     sheets += [_case(entry, case) for case in dict.fromkeys(row["case"] for row in entry.rows)]
     sheets.append(Sheet("protocol", "Protocol", PROTOCOL, [_record(entry)]))
     return write_page(Page("Arena", _headline(entry), _said(entry), sheets), folder / "arena.html", folder / "arena.md")
@@ -94,7 +94,7 @@ def _headline(entry: Entry) -> Headline:
         table = overall(entry, track)
         if table:
             best = min(table, key=lambda name: table[name]["error"])
-            words.append(f"{track}: {best} has the least error of δ, {table[best]['error']:.3f}.")
+            words.append(f"{track.capitalize()}: {best} has the least error of δ, {table[best]['error']:.3f}.")
     return Headline("Quality and processor time, side by side", None, tuple(words))
 
 
@@ -112,7 +112,8 @@ def shown(number: str, value: float | None) -> str:
     """A number as tables show it; a dash where there is none."""
     if value is None:
         return "–"
-    return f"{value:.3f}" if number in ("dice", "ssim") else f"{value:.3g}"
+    digits = {"dice": ".3f", "ssim": ".3f", "memory": ".0f"}
+    return format(value, digits.get(number, ".3g"))
 
 
 def _table(track: str, table: dict[str, dict[str, float]], said: dict[str, str], caption: str) -> ScoreTable:
@@ -209,7 +210,7 @@ def _record(entry: Entry) -> ScoreTable:
 @styled
 def pareto_figure(track: str, table: dict[str, dict[str, float]]) -> Figure:
     """Errors of a track's contestants over their processor seconds, logarithmic; holosplat's markers are filled."""
-    figure = new_figure(WIDTH, 2.9)
+    figure = new_figure(WIDTH, 3.2)
     axes = figure.subplots(1, 1)
     handles, points = [], []
     for n, (name, numbers) in enumerate(table.items()):
@@ -225,5 +226,5 @@ def pareto_figure(track: str, table: dict[str, dict[str, float]]) -> Figure:
     axes.step([*x, 1.6 * max(xs)], [*y, y[-1]], where="post", color=FAINT, lw=0.8, zorder=1)
     axes.set(xlabel="processor time (s)", ylabel=CALLED[track, "error"])
     letter(axes, 0, track.capitalize())
-    figure.legend(handles=handles, loc="outside right upper")
+    figure.legend(handles=handles, loc="outside lower center", ncols=4)
     return figure
