@@ -67,7 +67,7 @@ CONTESTANTS = [
     ),
     *_ours(
         "jobs",
-        ("default", "default", "what `holosplat reconstruct` does by itself"),
+        ("default", "default", "holosplat reconstruct, as it decides by itself"),
         ("two-steps", "two_steps", "nonlinear retrieval of each view, total variation"),
     ),
     Contestant(BEST_PAIR, "jobs", "numpy", f"{WAVES}:pair", "the peers' best retrieval and best tomography"),

@@ -15,7 +15,7 @@ from ..arena.contest import TRACKS, Track
 from ..arena.history import Change, Entry, changes, mean, previous
 from .page import Entry as Cell
 from .page import Page, Picture, ScoreTable, Sheet, write_page
-from .plots import MARKERS, pareto_front
+from .plots import MARKERS, log_ticks, pareto_front
 
 MEASURES = {
     "kernels": ("error", "adjoint"),
@@ -100,10 +100,8 @@ def _headline(entry: Entry) -> Headline:
 
 def _said(entry: Entry) -> str:
     cases, failed = {row["case"] for row in entry.rows}, [row for row in entry.rows if row["status"] != "done"]
-    text = (
-        f"{len(cases)} sealed cases of {entry.size} × {entry.size} pixels, seed {entry.seed}; {len(entry.rows)} rows, "
-    )
-    text += f"{len(failed)} of them without a result. "
+    text = f"{len(cases)} sealed cases of {entry.size} × {entry.size} pixels, seed {entry.seed}. Of {len(entry.rows)} "
+    text += f"rows {len(failed)} have no result. "
     text += f"Not installed: {', '.join(entry.absent)}." if entry.absent else "Every peer is installed."
     return text
 
@@ -225,6 +223,8 @@ def pareto_figure(track: str, table: dict[str, dict[str, float]]) -> Figure:
     x, y = zip(*pareto_front(points))
     axes.step([*x, 1.6 * max(xs)], [*y, y[-1]], where="post", color=FAINT, lw=0.8, zorder=1)
     axes.set(xlabel="processor time (s)", ylabel=CALLED[track, "error"])
+    log_ticks(axes.xaxis)
+    log_ticks(axes.yaxis)
     letter(axes, 0, track.capitalize())
     figure.legend(handles=handles, loc="outside lower center", ncols=4)
     return figure
