@@ -6,6 +6,12 @@ The same fit of Gaussians without a view and with one, in turn, that a process r
 Chromium shows (--chromium), which draws with the same processors where there is no GPU. Measured is what lies between
 the first step of the fit and its last: processor time of this process (all threads, the server's too) and wall time;
 beside them the processor time of the threads that draw and send updates. With --write, rows join the table.
+
+    python benchmarks/live_view.py SCAN --first [--write]       # rows of docs/data/first_picture.csv
+
+Times from the call of `reconstruct` to the first picture, of runs that end with it; the first of them loads modules.
+Scans of the committed rows: `holosplat demo` (meshes), and `holosplat simulate demo/meshes/*.vtk --material haemoglobin
+--detector 512 512 --pixel-size 0.8e-6 --views 16 --out SCAN`; for 128 pixels the same with 128 and 3.2e-6.
 """
 
 from __future__ import annotations
@@ -17,7 +23,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +36,7 @@ from holosplat.io.reading import Part, Reading
 from holosplat.show.server import HOST, LiveView, Watch
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "data" / "live_view.csv"
+FIRST = OUT.with_name("first_picture.csv")
 COLUMNS = ("scan", "view", "run", "steps", "gaussians", "updates", "view_cpu_s", "cpu_s", "wall_s", "commit")
 FLAGS = ("--headless", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-proxy-server")
 
@@ -42,9 +49,10 @@ class Timed:
         self.steps, self.first, self.last = 0, (0.0, 0.0), (0.0, 0.0)
 
     def __call__(self, stage: str, fraction: float, record: dict[str, float], state: Callable[[], Any]) -> None:
-        now = (time.process_time(), time.perf_counter())
-        self.first = self.first if self.steps else now
-        self.steps, self.last = self.steps + 1, now
+        if record:  # a step, and not what a stage begins or ends with
+            now = (time.process_time(), time.perf_counter())
+            self.first = self.first if self.steps else now
+            self.steps, self.last = self.steps + 1, now
         if self._on_state is not None:
             self._on_state(stage, fraction, record, state)
 
@@ -116,6 +124,23 @@ def fitted(scan: hs.Scan, prior: hs.matter.MaterialPrior, watch: Watch | None) -
     return timed, len(done.object.centres)  # type: ignore[attr-defined]
 
 
+class Seen(Exception):
+    """Ends a run with its first picture."""
+
+
+def until_first_picture(scan: hs.Scan, prior: hs.matter.MaterialPrior) -> tuple[float, float]:
+    """Processor and wall time [s] from the call to the first picture."""
+    began = (time.process_time(), time.perf_counter())
+
+    def seen(stage: str, fraction: float, record: dict[str, float], state: Callable[[], Any]) -> None:
+        state()
+        raise Seen
+
+    with suppress(Seen):
+        hs.reconstruct(scan, prior, on_state=seen)
+    return time.process_time() - began[0], time.perf_counter() - began[1]
+
+
 def main() -> None:
     """Print the rows, and write them where asked."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -124,12 +149,23 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=3)
     parser.add_argument("--bin", type=int, default=1)
     parser.add_argument("--chromium", action="store_true")
+    parser.add_argument("--first", action="store_true")
     parser.add_argument("--write", action="store_true")
     given = parser.parse_args()
     scan = read_as(given.scan, Reading(part=Part(bin=given.bin))).in_memory()
     material = hs.materials.parse_material(given.material).delta_beta(scan.exposures.reference_energy)
     who = "chromium" if given.chromium else "reader"
     rows, prior = [], hs.MaterialPrior.known(material)
+    size = "×".join(map(str, scan.views.shape))
+    named = f"{size}, {len(scan.train())} views"
+    if given.first:
+        for run in range(given.pairs):
+            cpu, wall = until_first_picture(scan, prior)
+            rows.append({"scan": named, "run": run, "cpu_s": f"{cpu:.2f}", "wall_s": f"{wall:.2f}", "commit": commit()})
+            print(rows[-1], flush=True)
+        if given.write:
+            merge(rows, FIRST, "scan")
+        return
     for run in range(2 * given.pairs):
         seen, updates, own = run % 2 == 1, 0, 0.0
         if seen:
@@ -141,8 +177,7 @@ def main() -> None:
         else:
             timed, count = fitted(scan, prior, None)
         cpu, wall = (b - a for a, b in zip(timed.first, timed.last))
-        size = "×".join(map(str, scan.views.shape))
-        about = {"scan": f"{size}, {len(scan.train())} views", "view": who if seen else "none", "run": run}
+        about = {"scan": named, "view": who if seen else "none", "run": run}
         times = {"view_cpu_s": f"{own:.2f}", "cpu_s": f"{cpu:.2f}", "wall_s": f"{wall:.2f}", "commit": commit()}
         rows.append(about | {"steps": timed.steps, "gaussians": count, "updates": updates} | times)
         print(rows[-1], flush=True)

@@ -442,3 +442,19 @@ def mistakes() -> str:
         ("scan", "runs", "above the limit", "the limit"),
         [[row["family"], row["scenes"], row["covered"], row["factor"]] for row in rows],
     )
+
+
+@table("distances", "python benchmarks/distances.py", "an hour", "distances.csv")
+def distances() -> str:
+    """Errors of thickness from frames of one view at one, two and four distances, ours beside hotopy's."""
+    rows = read("distances.csv")
+    sets, lines = list(dict.fromkeys(row["distances"] for row in rows)), []
+    for photons in dict.fromkeys(row["photons"] for row in rows):
+        for who in dict.fromkeys((row["program"], row["method"]) for row in rows):
+            mine = [row for row in rows if (row["photons"], row["program"], row["method"]) == (photons, *who)]
+            found = [[float(row["error"]) for row in mine if row["distances"] == one] for one in sets]
+            seconds = max(float(row["seconds"]) for row in mine)
+            cells = [f"{sum(each) / len(each):.3f}" for each in found]
+            lines.append([photons if photons != "0" else "no noise", " ".join(who), *cells, f"{seconds:.2f}"])
+    named = [f"{one} m" if float(one) < 1 else f"{one} distances" for one in sets]
+    return markdown(("photons a pixel", "method", *named, "s"), lines)

@@ -64,9 +64,8 @@ def run_block(block: Block, folder: Path, shell: Path | None = None) -> None:
 
 
 def _environment() -> dict[str, str]:
-    """That of a terminal in which `python` and `holosplat` are those of these tests, without a screen."""
-    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
-    return os.environ | {"PATH": path, "MPLBACKEND": "agg"}
+    """That of a terminal without a screen. What `python` and `holosplat` are there says PATH."""
+    return os.environ | {"MPLBACKEND": "agg"}
 
 
 def misparsed(block: Block) -> str:

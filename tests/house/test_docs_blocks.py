@@ -9,14 +9,18 @@ run at a small size (`helpers.doc_small`).
 
 from __future__ import annotations
 
+import os
 import re
+import sys
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from helpers.doc_blocks import FAR, Block, blocks, given, misparsed, run, run_block
 from helpers.doc_small import PAGES as PAGES_SMALL
+from helpers.forked import served
 from holosplat.methods.presets import read_method
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -46,7 +50,16 @@ def name_of(page: Path) -> str:
     return page.relative_to(ROOT).as_posix()
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module", autouse=True)
+def _of_these_tests() -> Iterator[None]:
+    """`python` and `holosplat` in blocks are those of these tests."""
+    with served() as folder, pytest.MonkeyPatch.context() as patch:
+        places = (str(folder), str(Path(sys.executable).parent), os.environ.get("PATH", ""))
+        patch.setenv("PATH", os.pathsep.join(places))
+        yield
+
+
+@pytest.fixture(scope="module")
 def readme(tmp_path_factory) -> Path:
     """The folder in which all blocks of the README were run."""
     folder = tmp_path_factory.mktemp("readme")
@@ -116,7 +129,8 @@ def test_few_blocks_of_the_guide_run_nowhere():
 
 def test_what_fails_is_seen(tmp_path):
     """In a shell at its first command and in a pipe, and in Python; what has an excuse is not run."""
-    for text in ("```sh\nfalse\ntrue\n```\n", "```sh\nfalse | cat\n```\n", "```python\nassert 0\n```\n"):
+    ours = "```sh\nholosplat info nowhere.nxs\n```\n"
+    for text in (ours, "```sh\nfalse\ntrue\n```\n", "```sh\nfalse | cat\n```\n", "```python\nassert 0\n```\n"):
         with pytest.raises(AssertionError):
             run(text, tmp_path)
     run("```sh\n# needs network: a file\nfalse\n```\n\n```\nfalse\n```\n", tmp_path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from helpers.voxels import pronounced
+from holosplat.backends import implementation
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
 from holosplat.matter import Matter
@@ -89,6 +91,27 @@ def test_projection_conserves_mass(poses, pixel):
     mass = lines.sum(dim=(2, 3)) * pixel**2
     expected = (values.sum(dim=(1, 2, 3)) * PIXEL**3).expand(2, 2)
     assert torch.allclose(mass, expected, rtol=2e-5 if poses == "axis" else 2e-4, atol=0)
+
+
+@pytest.mark.parametrize("poses", ["axis", "any"])
+def test_backends_project_voxels_alike(poses):
+    """And each is asked for: line integrals and gradients, with empty voxels among others."""
+    grid, found = Grid.centred((9, 11, 7), PIXEL), []
+    values = torch.rand(1, *grid.shape, generator=torch.Generator().manual_seed(3))
+    values[:, 2:5] = 0
+    for backend in ("cpu", "reference"):
+        values = values.detach().requires_grad_()
+        with (
+            patch("holosplat.projectors.voxels.lattice.implementation", side_effect=implementation) as lattice,
+            patch("holosplat.projectors.voxels.slices.implementation", side_effect=implementation) as strips,
+        ):
+            lines = VoxelLines(grid, POSES[poses](2, (13, 15)), backend)(values)
+        asked = {call.args[1] for call in (*lattice.call_args_list, *strips.call_args_list)}
+        assert asked == {backend}
+        (gradient,) = torch.autograd.grad(lines.square().sum(), values)
+        found.append((lines.detach() / PIXEL, gradient / PIXEL**2))
+    for one, other in zip(*found):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("poses", ["axis", "any"])

@@ -16,8 +16,7 @@ from holosplat.methods import Auto
 from holosplat.motion.track import TrackOptions
 from holosplat.optics.background import LightOptions
 from holosplat.series.folder import SeriesFolder
-from holosplat.series.plan import Cut, SeriesPlan, Settings, Source, plan_series, prior_of
-from holosplat.series.watch import listed
+from holosplat.series.plan import Cut, SeriesPlan, Settings, Source, listed, plan_series, prior_of
 
 CELL = HAEMOGLOBIN.delta_beta(20.0)
 

@@ -14,7 +14,8 @@ from helpers.series import SETTINGS, known
 from holosplat.checks import InputError
 from holosplat.io.reading import Reading
 from holosplat.series import watch as watching
-from holosplat.series.watch import Folder, Watch, WatchFolder, Watching
+from holosplat.series.folder import Folder
+from holosplat.series.watch import Watch, WatchFolder, Watching
 
 
 class World:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -16,8 +17,9 @@ from ..matter import MaterialPrior
 from ..ranges import Jobs, Seed, ranged
 from ..series.collect import collect as join
 from ..series.folder import Row, SeriesFolder, line_of, some, table_of, time_left, verdict_of
-from ..series.plan import Cut, Settings, Slurm, Warm, plan_series
+from ..series.plan import Cut, Settings, Slurm, Warm, listed, plan_series
 from ..series.run import run_left
+from ..series.stream import RECEIVED, SCHEME, Stream, Streaming
 from ..series.watch import Watch, WatchFolder, Watching
 from ..tables import to_table
 from .light import RunLightFlags
@@ -116,8 +118,6 @@ def plan(
         seed: Seed of everything random.
         track: Follow closed bodies through all times of a task, as holosplat track does; else each is reconstructed.
     """
-    from ..series.watch import listed
-
     require(not matter.ranges(), "a series needs one number for --delta-beta; find it by reconstruct of one time.")
     settings = act.settings(track, seed)
     folder = SeriesFolder(out)
@@ -279,29 +279,41 @@ def watch(
     reading: Reading = Reading(),
     *,
     illumination: RunLightFlags = RunLightFlags(),
+    stream: Streaming = Streaming(),
     seed: Seed = 0,
 ) -> None:
-    """Reconstruct scans as they appear in a folder, each begun with what the last one gave, and keep a live page.
+    """Reconstruct scans as they appear in a folder, or times as they come from a socket, each begun with what the last
+    one gave, and keep a live page.
 
     The page is OUT/live.html, which a browser opens without a server. Ctrl-C ends the watch, and the same command goes
     on where it was.
 
     Args:
-        folder: Folder to watch; files in it, not those of folders in it.
+        folder: Folder to watch, files in it, not those of folders in it; or tcp://HOST:PORT of a ZeroMQ socket.
         out: Folder of the results, new or to go on with.
         seed: Seed of everything random.
     """
     require(not matter.ranges(), "a watch needs one number for --delta-beta; find it by reconstruct of one scan.")
     require(reading.part.time_frame is None, "a watch takes all times of a scan; choose some with --time-frames.")
     settings = Act(each, method, illumination=illumination).settings(track=False, seed=seed)
+    address = re.sub("^tcp:/+", SCHEME, str(folder))  # pathlib makes one slash of two
+    from_socket, result = address.startswith(SCHEME), WatchFolder(out)
+    source = result.path / RECEIVED if from_socket else folder
+    stray = not from_socket and stream != Streaming()
+    require(not stray, "--socket, --high-water, --most-waiting and --most-mb go with tcp://HOST:PORT; leave them.")
+    feed, asked = None, reading.as_table()
+    if from_socket:
+        feed, how = Stream(address, stream, reading, source, say), replace(how, settle=0.0)
+        told = replace(reading.told, sources=None, pulses=None)  # of messages; files have the views that are taken
+        reading = replace(reading, told=told)
     said = {
-        "folder": str(folder.resolve()),
+        "folder": address if from_socket else str(source.resolve()),
         "settings": to_table(settings.as_table()),
         "matter": asdict(matter),
-        "reading": reading.as_table(),
+        "reading": asked,
     }
-    result = WatchFolder(out)
-    say(f"watching {folder}; the page is {result.page}; Ctrl-C ends")
+    say(f"watching {address}; the page is {result.page}; Ctrl-C ends")
     with interruptible(lambda: f"ended; what {out} holds is whole, and the same command goes on from there"):
-        count = Watch(folder, result, settings, matter.prior, reading, how, say).run(said)
+        watch = Watch(source, result, settings, matter.prior, reading, how, say, stream=feed)
+        count = watch.run(said)
     say(f"ended after {count} scan(s)")

@@ -46,7 +46,7 @@ class Follow:
     """What `reconstruct` tells while it runs."""
 
     on_progress: FitProgress
-    on_state: FitState = lambda stage, fraction, record, state: None
+    on_state: FitState | None = None
 
 
 @contextmanager

@@ -16,10 +16,13 @@ from torch import Tensor
 
 from ..backends import resolve
 from ..baselines import HolographicTV, holographic_tv
+from ..baselines.algebraic import Algebraic, sirt
 from ..baselines.holographic_tv import retrieved
-from ..matter import DeltaBeta, MaterialPrior, Matter
+from ..geometry import Grid
+from ..matter import DeltaBeta, KnownRatio, MaterialPrior, Matter
 from ..optics.background import Background, Light
 from ..optics.noise import noise_levels
+from ..optics.retrieval import paganin
 from ..progress import Progress
 from ..representations import VoxelGrid
 from ..scan import Scan
@@ -27,6 +30,14 @@ from ..volume import Object
 from .assumed import assumed_material
 from .cross_validation import predicted_frames
 
+PICTURE_WIDTH, PICTURE_VIEWS = 48, 32
+"""Frames of a first picture are binned to about so many pixels, and it takes so many of them at most: on one core it is
+there in half a second."""
+PICTURE_RATIO = 1000.0
+"""δ/β of a first picture where it is not known, which only its blur depends on: that of soft matter and light elements
+is 300 to 3000 at 8 to 30 keV."""
+PICTURE_SWEEPS = Algebraic(sweeps=20, relaxation=1.9, nonnegative=True)
+"""Sweeps of its tomography: more change nothing that is seen."""
 WIDTH = 64
 """Frames are binned to about so many pixels at most, on which a volume takes a second."""
 FEWEST = 3
@@ -46,6 +57,27 @@ BY_VIEWS, BY_FISSION = "views set aside", "data fission"
 def coarse_binning(scan: Scan) -> int:
     """How many pixels along an edge are joined for first volumes."""
     return scan.largest_binning(math.ceil(max(scan.views.shape) / WIDTH))
+
+
+def first_picture(train: Scan, prior: MaterialPrior) -> VoxelGrid:
+    """A coarse volume of training frames at once, to look at: of several times, that of the one in the middle.
+
+    Paganin's filter on binned frames (`optics.retrieval.paganin`), then SIRT without negative values. Where δ is not
+    known, the densest voxel stands for one. Nothing random is drawn, and no result depends on it. Errors: `InputError`
+    for frames that cannot be retrieved.
+    """
+    one = train.at_instant(len(train.instants) // 2) if train.is_series else train
+    one = one[np.unique(np.linspace(0, len(one) - 1, min(len(one), PICTURE_VIEWS)).round().astype(int))]
+    scan = one.binned(one.largest_binning(math.ceil(max(one.views.shape) / PICTURE_WIDTH)))
+    ratio = prior.ratio if isinstance(prior, KnownRatio) else prior.delta_sign * PICTURE_RATIO
+    delta = prior.delta_sign * 1e-6  # any: the thickness is found in its units
+    delta, beta = prior.materials[0] if prior.materials else DeltaBeta(delta, delta / ratio)
+    known = {"missing": scan.gaps, "two_sided": prior.two_sided}
+    lines = paganin(torch.from_numpy(scan.frames), scan.exposures, delta, beta, **known)
+    grid = Grid.of_views(scan.views)
+    values = sirt(lines, scan.views, grid, None, lambda fraction: None, options=PICTURE_SWEEPS, **known)
+    top = 1.0 if prior.materials else max(float(values.abs().max()), 1e-30)
+    return VoxelGrid(values[None] / top, grid, Matter.one(delta * top, beta * top))
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,7 @@
 
 from .eigen_flats import EigenFlats, eigen_flats, significant
 from .flat_field import relative_intensity, unlit
-from .pixels import PixelRepair, defective_pixels
-from .rings import fixed_pattern
+from .pixels import PixelRepair, defective_pixels, fixed_pattern
 from .weights import TotalVariationWeights
 
 __all__ = [

@@ -1,8 +1,10 @@
 """Defective pixels: found by their levels in dark and flat frames, and filled from their neighbours. Frames of the
-wrong kind: a dark with the beam on, a flat with the sample in it, a projection without light or without the sample."""
+wrong kind: a dark with the beam on, a flat with the sample in it, a projection without light or without the sample.
+Rings: faults that stay in their pixels in all projections, such as noise and dust of too few flats."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,6 +29,12 @@ FILLED = "are filled from their neighbours, and have no weight"
 """End of warnings about pixels that have no value of their own."""
 NORMAL_MEDIAN = 0.6745
 """The median of |x| for a standard normal x."""
+FEWEST_IN_RINGS = 8
+"""Projections that must be there, or too much of the object would pass for what all have in common."""
+WIDEST_RING = 31
+"""Columns of a line that may be taken for a fault, at most."""
+DARKEST = 0.01
+"""Relative intensity below which a pixel counts as so bright: its logarithm has no meaning."""
 
 
 def defective_pixels(dark: np.ndarray, dark_noise: np.ndarray, flat: np.ndarray) -> np.ndarray:
@@ -245,3 +253,29 @@ def _unlike(frames: np.ndarray, least: float) -> np.ndarray:
         return np.zeros(len(frames), dtype=bool)
     off = np.sqrt(((frames - np.median(frames, axis=0)) ** 2).mean(axis=(1, 2)))
     return off > (least if len(frames) == 2 else max(least, TIMES * float(np.median(off))))
+
+
+def fixed_pattern(frame: Callable[[int], np.ndarray], count: int, width: int) -> np.ndarray:
+    """The factor [H, W], about 1, that all of `count` projections have in common in details finer than `width` columns.
+
+    It is the exponential of the mean of `ln I - median(ln I)`, the median over `width` columns: what turns with the
+    object is in other columns in every projection, and averages out; lines of the object along its own axis of rotation
+    do not, and are taken for faults, too. So is done row by row in sinograms as in "ring removal" (Boin & Haibel 2006),
+    here in relative frames [H, W], `frame(i)`, read one at a time. Errors: `InputError` for fewer than
+    `FEWEST_IN_RINGS` projections, or a width that is not odd or beyond 3 to `WIDEST_RING`.
+    """
+    from scipy.ndimage import median_filter  # which takes long to load
+
+    require(
+        3 <= width <= WIDEST_RING and width % 2 == 1,
+        f"rings must be an odd number of columns from 3 to {WIDEST_RING}, but it is {width}; take 5.",
+    )
+    require(
+        count >= FEWEST_IN_RINGS,
+        f"rings need at least {FEWEST_IN_RINGS} projections, but there are {count}; leave --rings.",
+    )
+    total = np.zeros(())
+    for i in range(count):
+        logarithm = np.log(np.maximum(frame(i), DARKEST))
+        total = total + (logarithm - median_filter(logarithm, (1, width), mode="nearest"))
+    return np.exp(total / count)

@@ -75,9 +75,7 @@ class _AboutAxis:
         (dx, _, dz), (x, _, z) = grid.voxel_size, grid.origin
         shifts = np.stack([views.shifts[:, 0], np.full(len(views), top + 0.5 * (high - low - 1) * pitch)], axis=1)
         part = Views(views.rotations, shifts, (high - low, views.shape[1]), pitch)
-        # torch's products on the CPU, for voxels are fitted without kernels, too
-        made_by = "cuda" if backend == "cuda" else "reference"
-        self._projector = SliceProjector(Grid((nz, high - low, nx), (dx, pitch, dz), (x, top, z)), part, made_by)
+        self._projector = SliceProjector(Grid((nz, high - low, nx), (dx, pitch, dz), (x, top, z)), part, backend)
 
     def __call__(self, values: Tensor) -> Tensor:
         array = values.transpose(1, 2)
@@ -97,8 +95,7 @@ class _AnyPose:
         self._matrices = None if fine is grid else axis_matrices(grid, fine)
         (nz, ny, nx), (x, y, z) = fine.shape, (o - 0.5 * d for o, d in zip(fine.origin, fine.voxel_size))
         between = Grid((nz + 1, ny + 1, nx + 1), fine.voxel_size, (x, y, z))
-        made_by = "cuda" if backend == "cuda" else "cpu"
-        self._projectors = (LatticeProjector(fine, views, made_by), LatticeProjector(between, views, made_by))
+        self._projectors = (LatticeProjector(fine, views, backend), LatticeProjector(between, views, backend))
 
     def __call__(self, values: Tensor) -> Tensor:
         if self._matrices is not None:

@@ -25,7 +25,7 @@ from ..methods.continued import Continued
 from ..methods.illumination import prepared
 from ..methods.keeper import NAME, Keeper
 from ..methods.kinds import decide_kind
-from ..progress import FitProgress
+from ..progress import FitProgress, FitState
 from ..representations import Stored, SurfaceMesh
 from ..scan import Scan
 from ..units import wavenumber
@@ -71,32 +71,38 @@ def quiet(stage: str, fraction: float, record: dict[str, float]) -> None:
 
 
 def reconstruct_time(
-    shot: Shot, settings: Settings, folder: RunFolder, before: Before | None = None, on_progress: FitProgress = quiet
+    shot: Shot,
+    settings: Settings,
+    folder: RunFolder,
+    before: Before | None = None,
+    on_progress: FitProgress = quiet,
+    on_state: FitState | None = None,
 ) -> Row:
     """Reconstruct one time into `folder`, and say what came of it; an unfinished run is continued.
 
     A time that goes on from the one before is also begun by itself, if its last round still is of use, for then matter
     has changed much, or if it explains its frames surely less well than the last time that began by itself explains its
-    own. The better one is kept (`_better`). Ctrl-C is passed on. Errors: `InputError` of `reconstruct`.
+    own. The better one is kept (`_better`). on_state: as of `reconstruct`. Ctrl-C is passed on. Errors:
+    `InputError` of `reconstruct`.
     """
     began, chosen = time.perf_counter(), folder.path / BEGUN
     if before is None or not settings.warm.on or not _same_field(before, shot.scan):
-        done = _run(shot, settings, settings.method, folder, on_progress)
+        done = _run(shot, settings, settings.method, folder, on_progress, on_state=on_state)
         return _written(shot, settings, folder, done, replace(shot.row, begun="cold"), began)
     warm = Continued.of(settings.method, before.folder.object.resolve(), settings.warm.effort)
     said = read_json(chosen) if chosen.is_file() else {}
     if said.get("begun") == "anew":  # it was cut off after that
-        done = _run(shot, settings, settings.method, folder, on_progress)
+        done = _run(shot, settings, settings.method, folder, on_progress, on_state=on_state)
         return _written(shot, settings, folder, done, replace(shot.row, **said), began)
     _remove_other(folder, warm)
-    done = _run(shot, settings, warm, folder, on_progress, before)
+    done = _run(shot, settings, warm, folder, on_progress, before, on_state)
     row, reference = replace(shot.row, begun="warm"), before.folder.path / REFERENCE
     left = _left(done, shot.scan)
     if _settled(done) and _as_good(left, reference):
         _keep(folder, read_array(reference, WHAT))
         return _written(shot, settings, folder, done, row, began)
     alone = RunFolder(folder.path.with_name(f"{folder.path.name}.cold"))
-    cold = _run(shot, settings, settings.method, alone, on_progress)
+    cold = _run(shot, settings, settings.method, alone, on_progress, on_state=on_state)
     decision = _better(shot, settings, {"warm": done, "cold": cold})
     said = {"begun": "warm" if decision.choice == "warm" else "anew", "decided": decision.line}
     if decision.choice == "warm":
@@ -211,6 +217,7 @@ def _run(
     folder: RunFolder,
     on_progress: FitProgress,
     before: Before | None = None,
+    on_state: FitState | None = None,
 ) -> Reconstruction:
     matter = settings.matter
     if before is not None:  # it was decided there
@@ -226,6 +233,7 @@ def _run(
         folder=folder,
         resume=True,
         on_progress=on_progress,
+        on_state=on_state,
     )
     if not done.finished:
         raise KeyboardInterrupt

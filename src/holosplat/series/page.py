@@ -50,7 +50,7 @@ class Frame:
 @dataclass(frozen=True)
 class SeriesPage:
     """Content of a page. failed: reasons by what failed; events: a line each; refresh: seconds after which a browser
-    reads it again; 0: never."""
+    reads it again; 0: never; begun: a time that is in work, of which there is a picture already."""
 
     title: str
     headline: Headline
@@ -60,6 +60,7 @@ class SeriesPage:
     notes: tuple[str, ...] = ()
     refresh: float = 0.0
     events: tuple[str, ...] = ()
+    begun: Frame | None = None
 
 
 def write_page(path: Path, page: SeriesPage) -> None:
@@ -71,7 +72,7 @@ def write_page(path: Path, page: SeriesPage) -> None:
 
 def render_page(page: SeriesPage) -> str:
     """The page as HTML."""
-    shown = [page.frames[i] for i in _evenly(len(page.frames))]
+    shown = [*(page.frames[i] for i in _evenly(len(page.frames))), *filter(None, [page.begun])]
     kept, unread = _maps(shown)
     told = not any(frame.row.quantity == "β" for frame in shown)
     kept = kept if told else [(frame, -2 * phase) for frame, phase in kept]  # -k∫β, which stands for the phase then
@@ -80,7 +81,8 @@ def render_page(page: SeriesPage) -> str:
     pictures = [
         {
             "number": frame.row.number,
-            "label": f"time {frame.row.number}: {frame.time:.6g} s of {Path(frame.row.scan).name}",
+            "label": f"time {frame.row.number}: {frame.time:.6g} s of {Path(frame.row.scan).name}"
+            + ", in work" * (frame is page.begun),
             "image": _png(phase, low, high),
         }
         for frame, phase in kept
@@ -94,7 +96,7 @@ def render_page(page: SeriesPage) -> str:
         told=told,
         ends=ends if abs(high) > abs(low) else ends[::-1],
         colours=[f"rgb{anchor}" for anchor in ANCHORS],
-        bar=_scale_bar(kept[-1][0]) if kept else None,
+        bar=next(filter(None, (_scale_bar(frame) for frame, _ in reversed(kept))), None),
         charts=_charts(page.frames),
         rows=[_cells(frame) for frame in page.frames[-MOST_ROWS:]],
         failed=page.failed,

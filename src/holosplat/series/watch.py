@@ -1,33 +1,33 @@
-"""Scans reconstructed as they appear in a folder, each begun with what the last one gave, and a page of them."""
+"""Scans reconstructed as they appear in a folder, or come from a socket, each begun with what the last one gave, and a
+page of them."""
 
 from __future__ import annotations
 
 import json
 import os
-import re
 import socket
-import stat
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
-from ..checks import InputError, as_written, require
+from ..checks import as_written, require
 from ..io.atomic import is_taken, require_parent, write_rows
-from ..io.formats import loader_of, read_frames, run_source
+from ..io.formats import read_frames, run_source
 from ..io.json import read_json, write_json
-from ..io.leftovers import is_hidden
 from ..io.lock import sole_writer
 from ..io.reading import Reading
 from ..matter import MaterialPrior
+from ..progress import PICTURE, FitState
 from ..ranges import Positive, Seconds, ranged
+from ..representations import Stored
 from ..scan import Scan
 from ..workflows.run_folder import RunFolder
-from .folder import ROW, Row, outcome_of, plain, read_row, write_row
-from .one_time import PHASE, Before, Shot, reconstruct_time
+from .folder import ROW, Folder, Found, Row, outcome_of, plain, read_row, write_row
+from .one_time import PHASE, Before, Shot, quiet, reconstruct_time, write_phase
 from .plan import Settings, at, times_of
+from .stream import Stream
 from .task import attempted
 
 FORMAT = "holosplat watch 1"
@@ -145,7 +145,10 @@ class _Failure:
 @dataclass
 class Watch:
     """A watch of `source` into `folder`; `run` does it. prior: of the matter, at a photon energy [keV]; say: tells
-    people what happens, a line each time."""
+    people what happens, a line each time; stream: writes what comes from a socket into `source`.
+
+    Of a stream the latest time is done first, and the others when nothing newer is there.
+    """
 
     source: Path
     folder: WatchFolder
@@ -156,11 +159,16 @@ class Watch:
     say: Callable[[str], None] = lambda text: None
     clock: Callable[[], float] = time.monotonic
     sleep: Callable[[float], None] = time.sleep
+    stream: Stream | None = None
     _failures: dict[tuple[str, int, int], _Failure] = field(default_factory=dict)
     _times: list[tuple[Row, Path]] = field(default_factory=list)
     _before: Before | None = None
     _done: set[tuple[str, int, int]] = field(default_factory=set)
     _said: float = 0.0
+    _seen: list[Seen] = field(default_factory=list)
+    _stale: bool = False
+    _begun_time: tuple[Row, Path] | None = None
+    _lag: str = ""
 
     def run(self, said: dict[str, object]) -> int:
         """Watch until the end that is asked for, or Ctrl-C, which is passed on; how many scans were done.
@@ -168,20 +176,27 @@ class Watch:
         said: what the folder keeps of the options, which must be the same when a watch goes on. What a watch that was
         cut off has begun is finished first. Errors: `InputError` for folders that do not fit.
         """
-        require(self.source.is_dir(), f"{self.source} must be a folder to watch, but it is none; check the path.")
+        there = self.stream is not None or self.source.is_dir()
+        require(there, f"{self.source} must be a folder to watch, but it is none; check the path.")
         self.folder.require_usable()
         with sole_writer(self.folder.path):
             self.folder.begin(dict(said))
             self._take_up()
             running = f"Process {os.getpid()} on {socket.gethostname()} looks for scans."
             try:
+                if self.stream is not None:
+                    self.source.mkdir(exist_ok=True)
+                    self.stream.start()
                 return self._loop(running)
             finally:
+                if self.stream is not None:
+                    self.stream.stop()
                 self._show("The watch has ended; the same command goes on.", 0.0)
 
     def _take_up(self) -> None:
         """What was done before."""
-        for seen in self.folder.seen():
+        self._seen = self.folder.seen()
+        for seen in self._seen:
             rows = [(run, row) for run, row in self.folder.rows(seen) if row.done]  # others are tried again
             for run, row in rows:
                 self._remember(run.path, row)
@@ -199,6 +214,8 @@ class Watch:
         self._show(running, self.how.refresh)
         while True:
             came = [found for found in files.complete(self.clock()) if self._wanted(found)]
+            if self.stream is not None:
+                self.stream.waiting, came = len(came), came[-1:]
             for found in came:
                 if self._do(found, running):
                     count += 1
@@ -207,10 +224,19 @@ class Watch:
                     return count
             if self.how.idle and self.clock() - last >= self.how.idle:
                 return count
-            if came or self.clock() - self._said >= HEARTBEAT_SECONDS:
+            if (
+                (came and self.stream is None)
+                or self.clock() - self._said >= HEARTBEAT_SECONDS
+                or (self._stale and self._is_due)
+            ):
                 self._show(running, self.how.refresh)
             if not came:
                 self.sleep(self.how.poll)
+
+    @property
+    def _is_due(self) -> bool:
+        """Whether a browser reads the page before it is written again; of a stream it is not written more often."""
+        return self.stream is None or self.clock() - self._said >= self.how.refresh
 
     def _wanted(self, found: Found) -> bool:
         if found.key in self._done:
@@ -241,8 +267,10 @@ class Watch:
         done = {row.frame for _, row in self.folder.rows(seen) if row.done}
         for frame in range(seen.times):
             if frame not in done:
-                self._time(found.path, scans[0], seen, frame)
-                self._show(running, self.how.refresh)
+                self._time(found, scans[0], seen, frame, running)
+                self._stale = True
+                if self._is_due:
+                    self._show(running, self.how.refresh)
         self._done.add(found.key)
         return True
 
@@ -251,17 +279,17 @@ class Watch:
 
     def _begun(self, found: Found, scan: Scan) -> Seen:
         """The number of a scan, which it keeps when a watch was cut off in it."""
-        before = self.folder.seen()
-        for seen in before:
+        for seen in reversed(self._seen):
             if seen.key == found.key:
                 return seen
-        first = before[-1].first + before[-1].times if before else 0
-        seen = Seen(len(before), found.key, first, len(times_of(scan)))
+        last = self._seen[-1] if self._seen else None
+        seen = Seen(len(self._seen), found.key, last.first + last.times if last else 0, len(times_of(scan)))
         self.folder.add(seen)
+        self._seen.append(seen)
         return seen
 
-    def _time(self, path: Path, scan: Scan, seen: Seen, frame: int) -> None:
-        run, times = self.folder.run(seen.number, frame), times_of(scan)
+    def _time(self, found: Found, scan: Scan, seen: Seen, frame: int, running: str) -> None:
+        path, run, times = found.path, self.folder.run(seen.number, frame), times_of(scan)
         row = Row(seen.first + frame, str(path.resolve()), frame, times[frame], "failed")
 
         def work() -> str:
@@ -269,22 +297,45 @@ class Watch:
             shown, part = at(scan, frame), self.reading.part
             reading = replace(self.reading, part=replace(part, time_frame=frame if len(times) > 1 else None))
             prior = self.prior(scan.exposures.reference_energy)
-            row = reconstruct_time(Shot(shown, prior, run_source(path, reading), row), self.settings, run, self._before)
+            look = self._look(row, self.folder.scan(seen.number) / f"t{frame:04d}.{PHASE}", shown, running)
+            shot = Shot(shown, prior, run_source(path, reading), row)
+            row = reconstruct_time(shot, self.settings, run, self._before, quiet, look)
             return ""
 
         reason = attempted(work)
+        if self._begun_time is not None:
+            self._begun_time[1].unlink(missing_ok=True)
+            self._begun_time = None
         if reason:
             row = replace(row, status="failed", reason=reason)
         write_row(self.folder.row(seen.number, frame), row)
         self._remember(run.path, row)
         name = plain(path.name) if len(times) == 1 else f"{plain(path.name)}, time {frame}"
-        self.say(f"{name}: {outcome_of(row) if row.done else plain(reason)}")
+        if self.stream is not None:
+            wait = max(self.stream.waiting - 1, 0)
+            self._lag = f"{time.time() - 1e-9 * found.changed:.1f} s after it came, {wait} wait"
+        self.say(f"{name}: {outcome_of(row) if row.done else plain(reason)}" + (self._lag and f"; {self._lag}"))
+
+    def _look(self, row: Row, path: Path, scan: Scan, running: str) -> FitState | None:
+        """What brings a time that is in work to the page: at once, coarse, and then as often as a browser reads it."""
+        if not self._is_due:
+            return None
+
+        def look(stage: str, fraction: float, record: dict[str, float], state: Callable[[], Stored]) -> None:
+            first = self._begun_time is None
+            if (stage == PICTURE) != first or not (first or self.clock() - self._said >= self.how.refresh):
+                return
+            write_phase(path, state(), scan)
+            self._begun_time = row, path
+            self._show(running, self.how.refresh)
+
+        return look
 
     def _show(self, state: str, refresh: float) -> None:
         """Bring the page and the table up to date."""
         from .page import Frame, SeriesPage, headline, write_page  # which need matplotlib
 
-        self._said = self.clock()
+        self._said, self._stale = self.clock(), False
         write_rows(self.folder.table, COLUMNS, (self._line(row, run) for row, run in self._times))
         frames = tuple(Frame(row, row.time_s, run / PHASE, self._relative(run)) for row, run in self._times if row.done)
         bad = [row for row, _ in self._times if not row.done]
@@ -293,10 +344,10 @@ class Watch:
         when = time.strftime("%Y-%m-%d %H:%M:%S")
         verdict = f"{len(frames)} times are done." if frames else "No scan has come yet."
         title = f"Scans of {plain(self.source.resolve().name)}"
-        write_page(
-            self.folder.page,
-            SeriesPage(title, headline(verdict, frames), f"{state} {when}", frames, failed, (), refresh),
-        )
+        said = f"{state} {when}" + (self._lag and f"; the last time was done {self._lag}")
+        begun = self._begun_time and Frame(self._begun_time[0], self._begun_time[0].time_s, self._begun_time[1], "")
+        page = SeriesPage(title, headline(verdict, frames), said, frames, failed, (), refresh, begun=begun)
+        write_page(self.folder.page, page)
 
     def _relative(self, run: Path) -> str:
         return run.relative_to(self.folder.path).as_posix()
@@ -306,87 +357,3 @@ class Watch:
         explained = "" if row.good is None else int(row.good)
         where = [row.number, row.scan, row.frame, f"{row.time_s:.9g}", row.status, row.begun, explained]
         return [*where, *numbers, f"{row.seconds:.3f}", self._relative(run), row.reason]
-
-
-def listed(paths: Sequence[Path]) -> list[Path]:
-    """The scans that `paths` name, in order: scans themselves, or folders of scan files, in the order of their names.
-
-    Errors: `InputError` for a folder that is neither a scan nor holds scan files.
-    """
-    found = list[Path]()
-    for path in paths:
-        require(path.exists(), f"{path} must be a scan, or a folder of scans, but there is no such path; check it.")
-        if path.is_file() or _is_scan(path):
-            found.append(path)
-            continue
-        inside = [each for each in in_order(path) if _is_scan(each)]
-        require(bool(inside), f"{path} must be a scan, or a folder of scan files, but it holds none; name another.")
-        found += inside
-    return found
-
-
-def in_order(folder: Path) -> list[Path]:
-    """The regular files of a folder by name, numbers as numbers; hidden ones and links are passed over."""
-    files = [path for path in folder.iterdir() if not is_hidden(path) and not path.is_symlink() and path.is_file()]
-    return sorted(files, key=natural)
-
-
-def natural(path: Path) -> list[tuple[int, int | str]]:
-    """A key that sorts scan2 before scan10."""
-    words = re.split(r"([0-9]+)", path.name)
-    return [(0, int(word)) if word.isascii() and word.isdigit() else (1, word) for word in words]
-
-
-def _is_scan(path: Path) -> bool:
-    try:
-        loader_of(path)
-    except InputError:
-        return False
-    return True
-
-
-@dataclass(frozen=True)
-class Found:
-    """A file as it was when it was looked at: its size, and when it was changed [ns]."""
-
-    path: Path
-    size: int
-    changed: int
-
-    @property
-    def key(self) -> tuple[str, int, int]:
-        """What makes it another one: name, size and time of the change."""
-        return self.path.name, self.size, self.changed
-
-
-@dataclass
-class Folder:
-    """Regular files in `path` whose names fit `pattern`, links and hidden names apart; a file is complete once it has
-    stayed as it is for `settle` seconds: a copy that is under way grows, and a rename brings a whole file."""
-
-    path: Path
-    pattern: str = "*"
-    settle: float = 2.0
-    _since: dict[tuple[str, int, int], float] = field(default_factory=dict)
-
-    def complete(self, now: float) -> list[Found]:
-        """The complete files by name, at the time `now` [s] of any clock that goes on."""
-        there = {found.key: found for found in self._look()}
-        self._since = {key: self._since.get(key, now) for key in there}
-        ready = [there[key] for key, since in self._since.items() if now - since >= self.settle]
-        return sorted(ready, key=lambda found: natural(found.path))
-
-    def _look(self) -> list[Found]:
-        found = []
-        with os.scandir(self.path) as entries:
-            for entry in entries:
-                path = Path(entry.path)
-                if is_hidden(path) or not fnmatch(entry.name, self.pattern):
-                    continue
-                try:
-                    seen = entry.stat(follow_symlinks=False)
-                except OSError:  # gone since
-                    continue
-                if stat.S_ISREG(seen.st_mode):
-                    found.append(Found(path, seen.st_size, seen.st_mtime_ns))
-        return found

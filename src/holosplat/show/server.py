@@ -19,6 +19,7 @@ import numpy as np
 
 from ..checks import InputError, require
 from ..mesh import TriangleMesh
+from ..progress import PICTURE
 from ..representations import Stored
 from ..units import format_length
 from .parts import COLOUR, HALF_EDGE, Frame, Shown, Splats, legend, shown
@@ -249,12 +250,12 @@ class Watch:
 
     The object is taken at the end of a step, of the first one of a stage always, and drawn by another thread. The next
     update waits until the last one's cost is `SHARE` of the time. While no browser is there, only words are kept, and
-    nothing is drawn.
+    nothing is drawn but the coarse volume before all work, which a browser that comes later finds.
     """
 
     def __init__(self, view: LiveView) -> None:
         self._view = view
-        self._next, self._cost, self._stage = 0.0, 0.0, ""
+        self._next, self._cost, self._stage, self._coarse = 0.0, 0.0, "", True
         self._busy = threading.Event()
 
     def on_progress(self, stage: str, fraction: float, record: dict[str, float]) -> None:
@@ -270,22 +271,24 @@ class Watch:
             return
         self._stage, self._next = stage, now + INTERVAL_S
         self._view.tell(*words(stage, fraction, record))
-        if not self._view.watched:
+        if not (self._view.watched or stage == PICTURE):
             return
         began = time.thread_time()
         found = state()
         self._cost = time.thread_time() - began
         self._busy.set()
-        threading.Thread(target=self._draw, args=(found,), daemon=True).start()
+        threading.Thread(target=self._draw, args=(found, stage == PICTURE), daemon=True).start()
 
-    def _draw(self, found: Stored) -> None:
+    def _draw(self, found: Stored, coarse: bool) -> None:
         began = time.thread_time()
         try:
-            if self._view.frame is None:
-                self._view.frame = Frame.around(found.enclosing_grid(1))
+            if self._coarse:  # nothing yet, or what fills its whole grid
+                self._view.frame, self._coarse = Frame.around(found.enclosing_grid(1)), coarse
             self._view.show(shown(found))
+        except InputError as error:  # there is no surface
+            self._view.tell(str(error))
         finally:
-            cost = self._cost + time.thread_time() - began
+            cost = 0.0 if coarse else self._cost + time.thread_time() - began
             self._next = time.perf_counter() + max(INTERVAL_S, cost / SHARE)
             self._busy.clear()
 
@@ -293,6 +296,7 @@ class Watch:
 def words(stage: str, fraction: float, record: dict[str, float]) -> list[str]:
     """The description of a step."""
     numbers = {name: record[name] for name in ("loss", "count") if name in record}
-    said = [f"{stage}: {fraction:.0%}", f"step {record.get('step', 0):.0f}"]
+    said = [f"{stage}: {fraction:.0%}"]
+    said += [f"step {record['step']:.0f}"] if "step" in record else []
     said += [f"loss {numbers['loss']:.4g}"] if "loss" in numbers else []
     return said + ([f"{numbers['count']:.0f} Gaussians"] if "count" in numbers else [])

@@ -8,7 +8,7 @@ from typing import Any
 
 from ..align.poses import PoseOptions
 from ..backends import in_main_memory, resolve
-from ..checks import as_written, positive
+from ..checks import InputError, as_written, note, positive
 from ..fit.run import Record, Run, Running
 from ..inference import Decision
 from ..io.json import write_json
@@ -17,15 +17,17 @@ from ..io.volumes import write_guess
 from ..learning.start import GuessedMatter
 from ..matter import MaterialPrior, MatterKind
 from ..methods import Auto, Gaussians, Method, Settled, Task, finished, learned, settled
+from ..methods.first_volumes import first_picture
 from ..methods.illumination import prepared
 from ..methods.keeper import Keeper
 from ..methods.kinds import unseen_kinds
-from ..methods.method import Ended, run_stages
+from ..methods.method import Ended, Look, run_stages
 from ..methods.uncertain import Determined, Uncertain
 from ..optics.background import LightOptions
 from ..optics.sampling import fringe_sampling
-from ..progress import FitProgress, FitState
+from ..progress import PICTURE, FitProgress, FitState
 from ..ranges import require_plausible
+from ..representations import Stored
 from ..scan import Scan
 from .choice import Choice
 from .preconditions import (
@@ -67,7 +69,7 @@ def reconstruct(
     folder: RunFolder | None = None,
     resume: bool = False,
     on_progress: FitProgress = lambda stage, fraction, record: None,
-    on_state: FitState = lambda stage, fraction, record, state: None,
+    on_state: FitState | None = None,
 ) -> Reconstruction:
     """Reconstruct the object in the training frames of `scan`: the best state of `method` by these frames.
 
@@ -76,6 +78,8 @@ def reconstruct(
     uncertain: ranges of distance, energy or δ/β (default: exact), which the result estimates as `constants`
     refine: how to estimate poses, too (default: as in the scan); the result has them as `geometry`
     folder: for all files; with `resume=True` a later call continues from the last checkpoint, to the same result
+    on_state: is first given a coarse volume, within a second or so, then better ones as they come (`FitState`); where
+        there can be no coarse one, a note says why. The result is the same with and without
 
     Ctrl-C (KeyboardInterrupt) ends a fit with the state that it has reached (`finished` is False). Errors: `InputError`
     for scans without training frames or matter, or of several times where `method` takes one, for other folders,
@@ -112,12 +116,13 @@ def reconstruct(
         if folder is not None and resume and refine is None and is_complete(folder, config):
             return load_reconstruction(folder)
         goes_on(folder, config, resume)
-        geometry = None
+        run, geometry = _FolderRun(folder, on_progress, on_state), None
+        if on_state is not None and not run.saved:
+            _show_first(scan, prior, on_state)
         if refine is not None:
             require_compatible(ranges)
             geometry = saved_geometry(folder, resume) or trained_geometry(scan, prior, refine, assumed, tell)
             scan = geometry.applied(scan)
-        run = _FolderRun(folder, on_progress, on_state)
         task = Task(
             scan.train(), prior, seed, tell, assumed, freedom=freedom_of(geometry, refine), on_start=run.start_at
         )
@@ -142,7 +147,7 @@ def reconstruct(
         with run.as_written():
             keeper.load(run.saved.get("kept"))
         run.state = lambda: {"kept": keeper.state_dict(), "decided": [each.as_dict() for each in run.start]}
-        ended = _with_best(run_stages(found.method, task, keeper.look, run), keeper)
+        ended = _with_best(run_stages(found.method, task, run.shows(keeper.look), run), keeper)
         done = _reconstruction(run, ended, keeper, found, method.kind)
         if refine is None or geometry is None:
             return done
@@ -151,6 +156,16 @@ def reconstruct(
         if folder is not None:
             keep_geometry(folder, geometry, planned)
         return replace(done, geometry=geometry)
+
+
+def _show_first(scan: Scan, prior: MaterialPrior, on_state: FitState) -> None:
+    """Show a coarse volume before all work, or say why there is none."""
+    try:
+        found = first_picture(scan.train(), prior)
+    except InputError as error:
+        note(f"there is no first picture: {error}")
+        return
+    on_state(PICTURE, 0.0, {}, lambda: found)
 
 
 def load_reconstruction(folder: RunFolder) -> Reconstruction:
@@ -199,13 +214,23 @@ class _FolderRun(Run):
     config: entries of config.json; start: the decision on what a fit starts from, where a network was asked
     """
 
-    def __init__(self, folder: RunFolder | None, on_progress: FitProgress, on_state: FitState) -> None:
+    def __init__(self, folder: RunFolder | None, on_progress: FitProgress, on_state: FitState | None) -> None:
         super().__init__(folder)
         self.folder, self.on_progress, self.on_state = folder, on_progress, on_state
         self.config, self._pending = dict[str, Any](), list[Record]()
         self._guess: GuessedMatter | None = None
         with self.as_written():
             self.start = tuple(Decision.from_dict(each) for each in self.saved.get("decided", ()))
+
+    def shows(self, look: Look) -> Look:
+        """`look`, and then what stages begin and end with is shown."""
+
+        def both(name: str, found: Stored, oversample: int, fitted: bool, train: Scan) -> None:
+            look(name, found, oversample, fitted, train)
+            if self.on_state is not None:
+                self.on_state(name, float(name != "start"), {}, lambda: found.on(in_main_memory(found.backend)))
+
+        return both
 
     def start_at(self, decision: Decision, guess: GuessedMatter | None) -> None:
         """Take in what a fit starts from."""
@@ -235,7 +260,8 @@ class _FolderRun(Run):
         def look(record: Record) -> None:
             self._pending.append(record)
             self.on_progress(name, fit.share, record)
-            self.on_state(name, fit.share, record, lambda: finished(fit).on(in_main_memory(fit.backend)))
+            if self.on_state is not None:
+                self.on_state(name, fit.share, record, lambda: finished(fit).on(in_main_memory(fit.backend)))
 
         complete = False
         try:
