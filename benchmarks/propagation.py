@@ -6,8 +6,8 @@
 Of every case of the suite (seed 101) two noise-free frames, the first for training and the first held out, are compared
 with three others, each as the root mean square of the difference over that of the frame's contrast:
 
-- `multislice`: `benchmarks/multislice.py`, which knows the scene and the set-up, and shares no code with us: its own
-  rays, slabs, waves and detector, on a raster of its own; `doubled`: from our frame on twice as fine a raster;
+- `multislice`: `holosplat_bench/suite/multislice.py`, which knows the scene and the set-up, and shares no code with us:
+  its own rays, slabs, waves and detector, on a raster of its own; `doubled`: from our frame on twice as fine a raster;
 - `optics`: its waves and detector behind our line integrals, on our raster: what single precision and the paraxial
   approximation cost;
 - `hotopy`: the same with the propagator of hotopy (GPL, extra `bench`), where it is installed.
@@ -30,12 +30,10 @@ from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
-import multislice as other
 import numpy as np
 import torch
 from machine import commit
 from rows import read, write
-from scipy import fft
 
 from holosplat.beamline.declared.declaration import Case
 from holosplat.beamline.simulate import Simulation, simulated_frames
@@ -43,52 +41,19 @@ from holosplat.model import Instrument
 from holosplat.scan import Exposures
 from holosplat.specimens.continuous import ContinuousScene
 from holosplat.specimens.scene import MeshScene
+from holosplat_bench.suite import multislice as other
+from holosplat_bench.suite.arena.cases import multislice_frames, raster
 from holosplat_bench.suite.case import case_names, load_case
 
 SEED, SLABS = 101, 8
-FRINGE_SAMPLES, LEAST_SAMPLES, MOST_SAMPLES = 12, 8, 20
-"""Of the other program, on the first fringe and on a pixel: half as many again as `simulate` takes, and more."""
 NUMBERS = ("contrast", "multislice", "doubled", "thin", "optics", "hotopy")
 COLUMNS = ("case", "also", "seed", "view", "held_out", "samples", *NUMBERS, "seconds", "machine", "commit")
 
 
-def raster(taken: Exposures) -> other.Raster:
-    """The raster of the other program for one exposure: margins that hold the light of all but the finest fringes."""
-    pixel, z = taken.views.pixel_size, float(taken.distance[0])
-    spread = other.wavelength(float(taken.energy_kev[0])) * z
-    fringe = math.sqrt(spread) or math.inf
-    samples = min(MOST_SAMPLES, max(LEAST_SAMPLES, math.ceil(FRINGE_SAMPLES * pixel / fringe)))
-    reach = math.ceil(spread * samples / (4 * pixel**2)) + 6  # of half the finest frequency of the raster
-    margins = tuple(_margin(n, min(reach, n), samples) for n in taken.views.shape)
-    sx, sy = taken.views.shifts[0]
-    return other.Raster(taken.views.shape, pixel, samples, (margins[0], margins[1]), (float(sx), float(sy)))
-
-
-def _margin(pixels: int, least: int, samples: int) -> int:
-    """The least margin with which the transforms are fast."""
-    while fft.next_fast_len((pixels + 2 * least) * samples) != (pixels + 2 * least) * samples:
-        least += 1
-    return least
-
-
-def matter(scene: MeshScene | ContinuousScene, rotation: np.ndarray, on: other.Raster) -> other.Matter:
-    """A scene as the other program sees it."""
-    if isinstance(scene, MeshScene):
-        pairs = zip(scene.meshes, scene.materials)
-        return other.Surfaces.of(((m.vertices, m.faces, *of) for m, of in pairs), rotation, on)
-    return other.Ellipsoids.of(scene.elements, rotation, on)
-
-
 def other_frames(scene: MeshScene | ContinuousScene, taken: Exposures) -> tuple[np.ndarray, np.ndarray]:
     """One frame [h, w] by the other program, of `SLABS` slabs and of one."""
-    on, energy = raster(taken), float(taken.energy_kev[0])
-    met = matter(scene, taken.views.rotations[0], on)
-    radius = float(np.linalg.norm(scene.bounds, axis=1).max())
-    made = []
-    for count in (SLABS, 1):
-        wave = other.behind(met, np.linspace(-radius, radius, count + 1), energy, on)
-        made.append(other.frame(wave, float(taken.distance[0]), energy, float(taken.psf_sigma_px[0]), on))
-    return made[0], made[1]
+    slabs, one = multislice_frames(scene, taken, (SLABS, 1))
+    return slabs, one
 
 
 def optics_alone(

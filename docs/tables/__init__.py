@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from . import alignment, learning, matter, measured, motion, moving, printed, runs, thesis
+from . import alignment, arena, learning, matter, measured, motion, moving, printed, runs, thesis
 from .benchmark import TABLES, Table
 
 __all__ = [
     "TABLES",
     "Table",
     "alignment",
+    "arena",
     "learning",
     "matter",
     "measured",

@@ -13,6 +13,7 @@ import pytest
 
 import holosplat as hs
 from holosplat_bench.suite.methods import METHODS
+from holosplat_bench.suite.random_specimens import Room
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 MATERIAL = hs.DeltaBeta(1e-7, 1e-10)
@@ -41,12 +42,12 @@ def row(families, light="as measured", matter="levels", error=0.1, told="no", **
 
 def test_every_family_finds_room_for_its_matter(scenes):
     assert len(scenes.SIMULATED) + len(scenes.MEASURED_FAMILIES) >= 16
-    room = scenes.Room(15e-6, 50e-6, 45e-6, 50e-6)
+    room = Room(15e-6, 50e-6, 45e-6, 50e-6)
     views = hs.Views.from_angles([0.0], (50, 56), 1e-6)
     for name, family in scenes.SIMULATED.items():
         thick = []
         for seed in (1, 2):
-            matter = family._placed(np.random.default_rng(seed), room)(MATERIAL)
+            matter = family.placed(np.random.default_rng(seed), room)(MATERIAL)
             thick.append(np.asarray(matter.project(views)[0]))
         assert thick[0].max() > 0, name
         assert not np.array_equal(*thick) or name == "head", name

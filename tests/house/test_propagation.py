@@ -1,4 +1,4 @@
-"""The frames of `simulate` are those of a second program, `benchmarks/multislice.py`, which shares no code with it."""
+"""The frames of `simulate` are those of a second program of other code (`holosplat_bench/suite/multislice.py`)."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_rays_keep_what_they_pierce(propagation):
 
 
 def test_the_second_program_imports_nothing_of_the_first():
-    tree = ast.parse((BENCHMARKS / "multislice.py").read_text(encoding="utf-8"))
+    tree = ast.parse((BENCHMARKS.parent / "src/holosplat_bench/suite/multislice.py").read_text(encoding="utf-8"))
     named = {n.module for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)}
     named |= {a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names}
     assert named == {"__future__", "collections.abc", "dataclasses", "itertools", "typing", "numpy", "scipy"}

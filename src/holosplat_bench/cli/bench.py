@@ -166,15 +166,85 @@ def report(folder: Positional[Path] = Path("bench")) -> None:
         _say(f"wrote {path}")
 
 
+@dataclass(frozen=True)
+class Draw:
+    """How sealed cases are drawn, and how long contestants may take."""
+
+    seed: Seed = FIRST_SEED
+    """Seed from which matter, geometry and noise are drawn; options were tuned on seeds below 100."""
+    size: int = 48
+    """Pixels along an edge of frames and volumes: bodies are resolved, and all takes an hour."""
+    limit: float = 300.0
+    """Wall time after which a contestant is stopped [s]: many times what any takes on such cases."""
+
+
+def arena(
+    cases: tuple[str, ...] = (),
+    tracks: tuple[str, ...] = (),
+    out: Kept = Path("arena"),
+    history: Path | None = None,
+    draw: Draw = Draw(),
+    retry: bool = False,
+    list_only: Annotated[bool, arg(name="list")] = False,
+) -> None:
+    """Run other people's programs beside holosplat on sealed cases under one clock, and write one page.
+
+    Rows that are there already are kept, so an interrupted arena goes on. Peers that are not installed are listed.
+
+    Args:
+        cases: Names of sealed cases (default: all twelve).
+        tracks: Kinds of contests: kernels, steps, retrieval, tomography, jobs (default: all).
+        out: Folder of the arena, new or to go on with; arena.html and entry.json are written there.
+        history: Folder of the time line, such as docs/data/arena: earlier entries are compared, and this one is added.
+        retry: Run again what failed.
+        list_only: Only list cases, tracks and contestants.
+    """
+    from holosplat.io.lock import sole_writer
+
+    from ..suite.arena.cases import FAMILIES
+    from ..suite.arena.entrants import CONTESTANTS
+    from ..suite.arena.run import Arena, ArenaFolder, chosen_tracks, entry_of, run_arena
+    from ..suite.run import chosen
+
+    made = Arena(chosen("--cases", cases, list(FAMILIES)), chosen_tracks(tracks), draw.seed, draw.size, draw.limit)
+    if list_only:
+        print("cases:", *made.cases, sep="\n  ")
+        for one in CONTESTANTS:
+            print(f"  {one.track:11} {one.name:22} {one.summary}{'' if one.installed else ' (not installed)'}")
+        return
+    require(history is None or history.is_dir(), f"--history must be a folder that exists, but {history} is none.")
+    folder = ArenaFolder(out)
+    folder.require_usable()
+    if made.absent:
+        _say(f"not installed, and so left out: {', '.join(made.absent)}; pip install 'holosplat[bench]' has them")
+    try:
+        with sole_writer(out), _Screen() as screen:
+            run_arena(made, folder, retry=retry, on_progress=screen.show, on_row=screen.tell_arena)
+    except KeyboardInterrupt:
+        _say(f"interrupted; what {out} holds is whole, and the same command goes on from there")
+        raise SystemExit(INTERRUPTED) from None
+    from ..suite.arena.history import read_history
+    from ..suite.pages.arena import write_arena
+
+    entry = entry_of(made, folder)
+    entry.write(folder.entry)
+    if history is not None:
+        entry.write(history / entry.file)
+    for path in write_arena(entry, [] if history is None else read_history(history), folder.path):
+        _say(f"wrote {path}")
+
+
 def bench(
     act: Annotated[
         Annotated[None, subcommand("run", constructor=with_checked_arguments(run))]
         | Annotated[None, subcommand("report", constructor=with_checked_arguments(report))]
+        | Annotated[None, subcommand("arena", constructor=with_checked_arguments(arena))]
         | Annotated[None, subcommand("thesis", constructor=with_checked_arguments(thesis))],
         arg(name=""),
     ],
 ) -> None:
-    """Compare methods on cases, under one physics and one set of scores (run, report); rerun the thesis' study."""
+    """Compare methods on cases, under one physics and one set of scores (run, report), and other people's programs with
+    holosplat (arena); rerun the thesis' study."""
 
 
 class _Screen:
@@ -199,6 +269,13 @@ class _Screen:
         """A row is written."""
         self._clear()
         _say(f"{row.case} {row.seed} {row.method}: {_outcome(row)} ({left} to go)")
+
+    def tell_arena(self, row: Row, left: int) -> None:
+        """A row of the arena is written."""
+        self._clear()
+        numbers = ", ".join(f"{name} {value:.3g}" for name, value in row.test.items() if value is not None)
+        said = f"{numbers}, {row.seconds:.3g} s" if row.done else f"no result: {row.reason}"
+        _say(f"{row.case} {row.method}: {said} ({left} to go)")
 
     def _clear(self) -> None:
         if self._bar is not None:

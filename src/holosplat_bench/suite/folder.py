@@ -94,7 +94,6 @@ def read_row(path: Path) -> Row:
     return row
 
 
-FORMAT = "holosplat bench 1"
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_+-]*")
 """Names of cases and methods, which become names of files."""
 
@@ -104,6 +103,8 @@ class BenchFolder:
 
     Every file is written whole or not at all, so that an interrupted benchmark can go on.
     """
+
+    FORMAT = "holosplat bench 1"
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
@@ -132,7 +133,7 @@ class BenchFolder:
         for folder in (self.path, self.rows, self.pictures, self.cases):
             folder.mkdir(exist_ok=True)
         if not self.marker.is_file():
-            write_json(self.marker, {"format": FORMAT})
+            write_json(self.marker, {"format": self.FORMAT})
 
     def case(self, case: str, seed: int) -> Path:
         """The folder of a case with a seed."""
@@ -176,7 +177,7 @@ class BenchFolder:
         return self.pictures / f"{good_name(case)}.{seed}.{good_name(name)}.npz"
 
     def _require_marked(self, sentence: str) -> None:
-        marked = self.marker.is_file() and read_json(self.marker).get("format") == FORMAT
+        marked = self.marker.is_file() and read_json(self.marker).get("format") == self.FORMAT
         require(marked, f"{sentence} holds other files; choose another.")
 
 

@@ -19,10 +19,11 @@ SPECIAL = re.compile(r"([\\`*_<>|\[\]~])")
 
 @dataclass(frozen=True)
 class Entry:
-    """A cell of a table; the best ones are bold."""
+    """A cell of a table; the best ones are bold, those that became worse red."""
 
     text: str
     best: bool = False
+    worse: bool = False
 
 
 @dataclass(frozen=True)

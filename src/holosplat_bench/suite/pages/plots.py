@@ -104,8 +104,8 @@ def tradeoff_figure(case: CaseResult, marks: Marks) -> Figure:
             _tradeoff_panel(panel, shown, marks, measure, cost)
             for reference in references:
                 _reference_line(panel, reference, measure)
-            _log_ticks(panel.xaxis)
-            _log_ticks(panel.yaxis)
+            log_ticks(panel.xaxis)
+            log_ticks(panel.yaxis)
             panel.set(xlabel=label, ylabel=deficit_name(measure))
             letter(panel, row * len(HEADLINE) + column, measure.name)
     return figure
@@ -152,7 +152,7 @@ def _dashes(reference: MethodResult) -> str | tuple:
     return (0, (4, 2)) if reference.name == CEILING else (0, (1, 1.5))
 
 
-def _log_ticks(axis: Axis) -> None:
+def log_ticks(axis: Axis) -> None:
     """Plain numbers: at 1, 2 and 5 times powers of ten where a logarithmic axis spans little, else at fewer."""
     low, high = axis.get_view_interval()
     decades = math.log10(high / low)
@@ -227,7 +227,7 @@ def sizes_figure(pictures: Curves, marks: Marks, pixel_size: float) -> Figure | 
     panel.set_xscale("log")
     panel.set(xlim=(diameters.min() / 1.1, diameters.max() * 1.1), ylim=(LOWEST, None))
     panel.set(xlabel="diameter (pixels)", ylabel="contrast left")
-    _log_ticks(panel.xaxis)
+    log_ticks(panel.xaxis)
     return figure
 
 
@@ -252,6 +252,6 @@ def overview_figure(cases: Sequence[CaseResult], marks: Marks) -> Figure:
         panel.set_yticks(range(len(cases)), [case.name for case in cases] if column == 0 else [""] * len(cases))
         panel.set(ylim=(len(cases) - 0.5, -0.5), xlabel=deficit_name(measure))
         panel.tick_params(axis="y", length=0)
-        _log_ticks(panel.xaxis)
+        log_ticks(panel.xaxis)
         letter(panel, column, measure.name)
     return figure

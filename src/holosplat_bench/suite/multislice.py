@@ -237,11 +237,11 @@ def travel(wave: np.ndarray, way: float, energy_kev: float, raster: Raster) -> n
         return wave
     fy, fx = raster.frequencies()
     square, largest = fy * fy + fx * fx, 1 / wavelength(energy_kev)
-    spectrum = fft.fft2(wave)
+    spectrum = np.asarray(fft.fft2(wave))
     # kz - k = 2π (√(1/λ² - f²) - 1/λ), written so that no digits cancel; waves beyond 1/λ do not travel
     turns = -square / (largest + np.sqrt(np.maximum(largest**2 - square, 0)))
     spectrum *= np.exp(2j * np.pi * way * turns) * (square < largest**2)
-    return fft.ifft2(spectrum)
+    return np.asarray(fft.ifft2(spectrum))
 
 
 def behind(matter: Matter, slabs: Sequence[float], energy_kev: float, raster: Raster) -> np.ndarray:
@@ -266,7 +266,7 @@ def behind(matter: Matter, slabs: Sequence[float], energy_kev: float, raster: Ra
 def frame(wave: np.ndarray, distance: float, energy_kev: float, psf_px: float, raster: Raster) -> np.ndarray:
     """The frame [h, w] of a `wave` [H, W] that leaves z = 0: means of the blurred intensity over pixels."""
     seen = travel(wave, distance, energy_kev, raster)
-    spectrum = fft.fft2(seen.real**2 + seen.imag**2)
+    spectrum = np.asarray(fft.fft2(np.real(seen) ** 2 + np.imag(seen) ** 2))
     fy, fx = raster.frequencies()
     to_the_middle = 0.5 * (raster.samples - 1) * raster.pitch
     for f in (fy, fx):
@@ -274,16 +274,16 @@ def frame(wave: np.ndarray, distance: float, energy_kev: float, psf_px: float, r
         spectrum *= np.exp(2j * np.pi * f * to_the_middle)
     rows, columns = (slice(m * raster.samples, (m + n) * raster.samples, raster.samples)
                      for m, n in zip(raster.margin, raster.shape))  # fmt: skip
-    return fft.ifft2(spectrum).real[rows, columns]
+    return np.real(np.asarray(fft.ifft2(spectrum)))[rows, columns]
 
 
 def sampled(wave: np.ndarray, distance: float, energy_kev: float, psf_px: float, raster: Raster) -> np.ndarray:
     """As `frame`, but each pixel is the plain mean of its samples: for comparisons on one and the same raster."""
     seen = travel(wave, distance, energy_kev, raster)
-    spectrum = fft.fft2(np.abs(seen) ** 2)
+    spectrum = np.asarray(fft.fft2(np.abs(seen) ** 2))
     for f in raster.frequencies():
         spectrum *= np.exp(-2 * (np.pi * f * psf_px * raster.pixel) ** 2)
-    return pixels(fft.ifft2(spectrum).real, raster)
+    return pixels(np.real(np.asarray(fft.ifft2(spectrum))), raster)
 
 
 def pixels(samples: np.ndarray, raster: Raster) -> np.ndarray:
