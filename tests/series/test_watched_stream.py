@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -357,8 +359,13 @@ def test_what_a_stream_cannot_be(beams, tmp_path):
     refused(holosplat("watch", "tcp://127.0.0.1:2", *out, "--exposures", beams), "was begun with another folder")
 
 
-def test_a_picture_of_the_time_in_work_is_on_the_page(files, beams, tmp_path, monkeypatch):
-    """Coarse at once, before the run has anything else; it is gone when the time is done. So for each scan."""
+@pytest.mark.parametrize("late", [False, True])
+def test_a_picture_of_the_time_in_work_is_on_the_page(late, files, beams, tmp_path, monkeypatch):
+    """Coarse at once, before the run has anything else; it is gone when the time is done. So for each scan.
+
+    Of a stream the page is not written more often than a browser reads it: a time that comes right after that is shown
+    later, while it is in work.
+    """
     import holosplat.series.watch as watching
 
     out, seen = tmp_path / "out", list[str]()
@@ -379,7 +386,14 @@ def test_a_picture_of_the_time_in_work_is_on_the_page(files, beams, tmp_path, mo
     one = Watch(
         incoming, WatchFolder(out), SETTINGS, known, Reading(), replace(Watching(), settle=0.0, poll=0.01, stop_after=2)
     )
+    if late:
+        one.stream, now = SimpleNamespace(start=lambda: None, stop=lambda: None, waiting=0), itertools.count()
+        one.clock, one.how = now.__next__, replace(one.how, refresh=20.0)
     assert one.run({}) == 2
+    assert ("in work" in seen[0]) == (not late)
+    if late:
+        assert any("in work" in page for page in seen)
+        return
     assert "a.nxs, in work" in seen[0]
     assert "data:image/png" in seen[0]
     assert any("b.nxs, in work" in page for page in seen)

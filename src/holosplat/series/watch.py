@@ -316,14 +316,17 @@ class Watch:
             self._lag = f"{time.time() - 1e-9 * found.changed:.1f} s after it came, {wait} wait"
         self.say(f"{name}: {outcome_of(row) if row.done else plain(reason)}" + (self._lag and f"; {self._lag}"))
 
-    def _look(self, row: Row, path: Path, scan: Scan, running: str) -> FitState | None:
-        """What brings a time that is in work to the page: at once, coarse, and then as often as a browser reads it."""
-        if not self._is_due:
-            return None
+    def _look(self, row: Row, path: Path, scan: Scan, running: str) -> FitState:
+        """What brings a time that is in work to the page: at once, coarse, and then as often as a browser reads it. A
+        time of a stream that is done sooner than that is not shown before."""
 
         def look(stage: str, fraction: float, record: dict[str, float], state: Callable[[], Stored]) -> None:
             first = self._begun_time is None
-            if (stage == PICTURE) != first or not (first or self.clock() - self._said >= self.how.refresh):
+            if stage == PICTURE:
+                due = first and self._is_due
+            else:
+                due = self.clock() - self._said >= self.how.refresh
+            if not due:
                 return
             write_phase(path, state(), scan)
             self._begun_time = row, path
