@@ -17,17 +17,9 @@ from holosplat.optics import NoiseModel
 from holosplat.optics.background import LightOptions
 from holosplat.representations import VoxelGrid
 from holosplat.workflows import Reconstruction, RunFolder, next_step, rehearsal
+from holosplat.workflows.certainty import Factor, centre_and_scale, conformal_quantile, errors_of
 from holosplat.workflows.next_step import MISTAKES, NULL, STEPS, compare_causes
-from holosplat.workflows.rehearsal import (
-    Again,
-    Factor,
-    Rehearsal,
-    centre_and_scale,
-    conformal_quantile,
-    errors_of,
-    read_rehearsal,
-    rehearse,
-)
+from holosplat.workflows.rehearsal import Again, Rehearsal, read_rehearsal, rehearse
 from holosplat.workflows.verdict import Verdict
 
 WATER = hs.materials.parse_material("water").delta_beta(20.0)
