@@ -7,17 +7,29 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.optimize import isotonic_regression
 
 import holosplat as hs
 from holosplat.geometry import Grid
 from holosplat.inference import Decision
 from holosplat.matter import DeltaBeta, MaterialPrior, Matter
 from holosplat.methods import METHODS
+from holosplat.metrics import dice
 from holosplat.optics import NoiseModel
 from holosplat.optics.background import LightOptions
 from holosplat.representations import VoxelGrid
+from holosplat.volume import Volume
 from holosplat.workflows import Reconstruction, RunFolder, next_step, rehearsal
-from holosplat.workflows.certainty import Factor, centre_and_scale, conformal_quantile, errors_of
+from holosplat.workflows.certainty import (
+    BINS,
+    Factor,
+    MatterMap,
+    centre_and_scale,
+    conformal_quantile,
+    errors_of,
+    matter_probabilities,
+    occupancy_counts,
+)
 from holosplat.workflows.next_step import MISTAKES, NULL, STEPS, compare_causes
 from holosplat.workflows.rehearsal import Again, Rehearsal, read_rehearsal, rehearse
 from holosplat.workflows.verdict import Verdict
@@ -105,12 +117,30 @@ def test_frames_of_a_rehearsal_are_those_of_the_result_with_noise_of_the_measure
 
     monkeypatch.setattr(rehearsal, "reconstruct", look)
     rehearse(done, scan, PRIOR, METHODS["ctf-tv"], times=2, causes=False)
-    first, second = (each.frames for each in seen)
-    assert first.shape == scan.train().frames.shape
-    noise, level = (first - second) / np.sqrt(2), NoiseModel.of_frames(scan.train().measured).level
-    assert noise.std() == pytest.approx(float(level.square().mean().sqrt()), rel=0.1)
-    predicted = hs.workflows.render(done, scan.train().exposures)
-    assert np.std(0.5 * (first + second) - predicted) == pytest.approx(noise.std() / np.sqrt(2), rel=0.15)
+    level = NoiseModel.of_frames(scan.train().measured).level
+    for each in seen:
+        assert each.frames.shape == scan.train().frames.shape
+        noise = each.frames - hs.workflows.render(done, each.exposures)
+        assert noise.std() == pytest.approx(float(level.square().mean().sqrt()), rel=0.15)
+    first, second = (each.views.rotations for each in seen)
+    assert not np.allclose(first, second)
+    given = scan.train().views.rotations
+    between = [turns[0].T @ turns[1] for turns in (first, second, given)]
+    assert [np.trace(turn) for turn in between] == pytest.approx([np.trace(between[2])] * 3)  # by one angle together
+
+
+def test_views_turn_about_what_they_look_at():
+    """A point there stays where it is on all detectors, and a quarter turn moves one beside it as the axis says."""
+    views = hs.Views.from_angles([0.0, 50.0], (5, 7), PIXEL)
+    middle = np.array([4.0, -2.0, 3.0]) * PIXEL
+    views = replace(views, shifts=(views.rotations @ middle)[:, :2])
+    scan = hs.Scan(np.ones((2, 5, 7), np.float32), hs.Exposures.of(views, 20.0, 0.03), np.zeros(2, bool))
+    turned = rehearsal._turned(scan, 90.0).views
+    assert Grid.of_views(turned).centre == pytest.approx(middle)
+    assert (turned.rotations @ middle)[:, :2] == pytest.approx(turned.shifts)
+    beside = middle + np.array([1.0, 0.0, 0.0]) * PIXEL
+    along = turned.rotations @ beside - np.c_[turned.shifts, (turned.rotations @ middle)[:, 2]]
+    assert along == pytest.approx(views.rotations @ np.array([0.0, 0.0, -1.0]) * PIXEL, abs=1e-15)
 
 
 def test_larger_pixels_are_rehearsed_on_measured_frames_of_such_pixels(few, monkeypatch):
@@ -125,6 +155,55 @@ def test_larger_pixels_are_rehearsed_on_measured_frames_of_such_pixels(few, monk
     shown = rehearse(done, scan, PRIOR, METHODS["ctf-tv"], times=2, bins=2, causes=False)
     assert seen == [(10, 11)] * 3
     assert shown.pixel == pytest.approx(2 * PIXEL)
+
+
+def test_the_map_of_matter_is_calibrated_on_what_it_was_counted_on(few):
+    """The mean probability over the voxels that were counted is the share of matter among them, but for the prior."""
+    shown = few[2]
+    voxels, matter = (shown.values(name).sum(axis=0) for name in ("voxels", "matter"))
+    table = shown.matter.table
+    assert voxels.sum() == 2 * 20 * 23 * 23
+    assert (np.diff(table) >= 0).all()
+    assert (voxels * table).sum() == pytest.approx(matter.sum(), abs=len(table))
+    assert shown.matter.values.shape == (23, 20, 23)
+    assert 0 < shown.matter.expected_dice < 1
+    assert f"expected by the map of matter: {shown.matter.expected_dice:.2f}" in "".join(shown.lines())
+    with pytest.raises(hs.InputError, match="is not kept; rehearse again"):
+        _ = replace(shown, found=None).matter
+
+
+def test_probabilities_are_the_isotonic_fit_of_shares():
+    """The twin: scipy's weighted isotonic regression; without disorder the shares themselves."""
+    rng = np.random.default_rng(4)
+    voxels = rng.integers(0, 200, 41).astype(float)
+    matter = np.floor(voxels * rng.random(41))
+    twin = isotonic_regression((matter + 0.5) / (voxels + 1), weights=voxels + 1).x
+    assert matter_probabilities(voxels, matter) == pytest.approx(twin, rel=1e-12)
+    rising = matter_probabilities(np.array([9.0, 9.0, 9.0]), np.array([0.0, 4.0, 9.0]))
+    assert rising == pytest.approx([0.05, 0.45, 0.95])
+    with pytest.raises(hs.InputError, match="among those counted"):
+        matter_probabilities(np.ones(2), np.array([1.0, 2.0]))
+
+
+def test_occupancies_of_known_noise_have_the_probabilities_of_bayes():
+    """Matter of occupancy 1 in a third of a box of odd sides, Gaussian noise: p = 1/(1 + 2 exp((1 - 2 o)/(2 σ²)))."""
+    rng, grid, sigma = np.random.default_rng(0), Grid.centred((31, 45, 53), PIXEL), 0.3
+    matter = rng.random(grid.shape) < 1 / 3
+    truth = Volume(1e-7 * matter, 1e-9 * matter, grid)
+    noisy = 1e-7 * (matter + sigma * rng.normal(size=grid.shape))
+    counts = occupancy_counts(Volume(noisy, 0.01 * noisy, grid), truth)
+    table = matter_probabilities(*(np.array(counts[name]) for name in ("voxels", "matter")))
+    middles = 0.5 * (BINS[1:] + BINS[:-1])[1:-1]
+    exact = 1 / (1 + 2 * np.exp((1 - 2 * middles) / (2 * sigma**2)))
+    assert table[1:-1] == pytest.approx(exact, abs=0.05)
+    other = MatterMap(Volume(noisy, noisy, grid), 1e-7, table)
+    both = float(other.values[noisy > 0.5e-7].sum()) * 2 / float((noisy > 0.5e-7).sum() + other.values.sum())
+    assert other.expected_dice == pytest.approx(both)
+    assert other.expected_dice == pytest.approx(dice(noisy > 0.5e-7, matter), abs=0.01)
+    assert other.on(grid) == pytest.approx(other.values, abs=1e-5)
+    finer = Grid.centred((31, 45, 105), PIXEL)
+    between = other.on(replace(finer, voxel_size=(PIXEL / 2, PIXEL, PIXEL), origin=grid.origin))
+    assert between[..., 1::2] == pytest.approx(0.5 * (other.values[..., 1:] + other.values[..., :-1]), abs=1e-5)
 
 
 def made(own: float, left: float, allowed: float, good: bool, cause: Decision | None = None) -> Rehearsal:
@@ -164,6 +243,7 @@ def test_rehearsals_are_kept_and_only_those_that_are_missing_are_made(tmp_path, 
     kept = read_rehearsal(folder)
     assert kept is not None
     assert kept.runs == more.runs
+    assert np.array_equal(kept.matter.values, more.matter.values)
     assert kept.lines() == more.lines()
     table = folder.read_summary()["rehearsal"]
     assert table["word"] == more.word

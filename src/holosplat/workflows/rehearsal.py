@@ -135,9 +135,7 @@ class Rehearsal:
     def matter(self) -> MatterMap:
         """Where matter is likely; `InputError` where what was found is not kept."""
         if self.found is None:
-            raise InputError(
-                "a map of matter needs the volume of the rehearsed run, but it was not kept; rehearse again."
-            )
+            raise InputError("a map of matter needs the volume that was rehearsed, but it is not kept; rehearse again.")
         voxels, matter = (self.values(name).sum(axis=0) for name in (VOXELS, MATTER))
         return MatterMap(self.found, self.unit, matter_probabilities(voxels, matter))
 
