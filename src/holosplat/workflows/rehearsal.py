@@ -381,6 +381,12 @@ def read_rehearsal(folder: RunFolder) -> Rehearsal | None:
         return Rehearsal.from_dict(table, read_volume(kept) if kept.is_file() else None)
 
 
+def matter_of(folder: RunFolder) -> MatterMap | None:
+    """Where rehearsals of a run say that matter is likely; None where none are kept."""
+    kept = read_rehearsal(folder)
+    return None if kept is None or kept.found is None or not kept.runs else kept.matter
+
+
 def _keep(folder: RunFolder | None, kept: Rehearsal) -> None:
     if folder is not None:
         folder.write_summary(folder.read_summary() | {ENTRY: kept.as_dict()})
