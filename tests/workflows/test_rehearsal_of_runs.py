@@ -19,7 +19,7 @@ from holosplat.optics import NoiseModel
 from holosplat.optics.background import LightOptions
 from holosplat.representations import VoxelGrid
 from holosplat.volume import Volume
-from holosplat.workflows import Reconstruction, RunFolder, next_step, rehearsal
+from holosplat.workflows import Reconstruction, RunFolder, certainty, next_step, rehearsal
 from holosplat.workflows.certainty import (
     BINS,
     Factor,
@@ -99,7 +99,7 @@ def test_a_biased_method_shows_its_bias_and_an_exact_one_has_none(few, monkeypat
     assert shown.values("error").min() > 0.1
     assert shown.values("dice").min() > 0.01
 
-    monkeypatch.setattr(rehearsal, "reconstruct", lambda *args, **how: done)
+    monkeypatch.setattr(certainty, "reconstruct", lambda *args, **how: done)
     exact = rehearse(done, scan, PRIOR, METHODS["ctf-tv"], times=2, causes=False)
     for name in ("delta", "volume", "centre", "dice", "error"):
         assert np.abs(exact.values(name)).max() < 1e-6
@@ -115,7 +115,7 @@ def test_frames_of_a_rehearsal_are_those_of_the_result_with_noise_of_the_measure
         seen.append(frames)
         return done
 
-    monkeypatch.setattr(rehearsal, "reconstruct", look)
+    monkeypatch.setattr(certainty, "reconstruct", look)
     rehearse(done, scan, PRIOR, METHODS["ctf-tv"], times=2, causes=False)
     level = NoiseModel.of_frames(scan.train().measured).level
     for each in seen:
@@ -134,8 +134,7 @@ def test_views_turn_about_what_they_look_at():
     views = hs.Views.from_angles([0.0, 50.0], (5, 7), PIXEL)
     middle = np.array([4.0, -2.0, 3.0]) * PIXEL
     views = replace(views, shifts=(views.rotations @ middle)[:, :2])
-    scan = hs.Scan(np.ones((2, 5, 7), np.float32), hs.Exposures.of(views, 20.0, 0.03), np.zeros(2, bool))
-    turned = rehearsal._turned(scan, 90.0).views
+    turned = rehearsal._turned(hs.Exposures.of(views, 20.0, 0.03), 90.0).views
     assert Grid.of_views(turned).centre == pytest.approx(middle)
     assert (turned.rotations @ middle)[:, :2] == pytest.approx(turned.shifts)
     beside = middle + np.array([1.0, 0.0, 0.0]) * PIXEL
@@ -151,7 +150,7 @@ def test_larger_pixels_are_rehearsed_on_measured_frames_of_such_pixels(few, monk
         seen.append(frames.views.shape)
         return done
 
-    monkeypatch.setattr(rehearsal, "reconstruct", look)
+    monkeypatch.setattr(certainty, "reconstruct", look)
     shown = rehearse(done, scan, PRIOR, METHODS["ctf-tv"], times=2, bins=2, causes=False)
     assert seen == [(10, 11)] * 3
     assert shown.pixel == pytest.approx(2 * PIXEL)
@@ -215,6 +214,22 @@ def made(own: float, left: float, allowed: float, good: bool, cause: Decision | 
     return Rehearsal(1, PIXEL, said, tuple(runs), cause=cause)
 
 
+def test_an_experiment_of_more_views_and_photons_is_foreseen_to_be_surer():
+    """Of the same cell; the truth is the mesh, on the grid of odd frames."""
+    cell = hs.specimens.random_cells(1, (14e-6, 14e-6, 14e-6), 1, 9e-6)
+    scene = hs.MeshScene.of_one_material(cell, WATER)
+    errors = []
+    for views, photons in ((3, 1e3), (12, 1e5)):
+        exposures = hs.Exposures.of(hs.Views.evenly_spaced(views, (17, 19), PIXEL), 20.0, 0.03)
+        shown = rehearsal.foresee(scene, exposures, photons, PRIOR, METHODS["ctf-tv"], times=2)
+        assert "total δ: up to" in "".join(shown.intervals())
+        assert shown.interval("error")[1] > shown.values("error").max()
+        errors.append(shown.values("error").mean())
+    assert errors[1] < 0.7 * errors[0]
+    with pytest.raises(hs.InputError, match="2 rehearsals or more"):
+        rehearsal.foresee(scene, exposures, 1e3, PRIOR, METHODS["ctf-tv"], times=1)
+
+
 def test_the_three_words(monkeypatch):
     factor = Factor(0.0, 1.5, 99)
     monkeypatch.setattr(rehearsal, "factors", lambda: {"residual": factor})
@@ -234,8 +249,8 @@ def test_rehearsals_are_kept_and_only_those_that_are_missing_are_made(tmp_path, 
     done = hs.reconstruct(scan, PRIOR, method, folder=folder)
     assert read_rehearsal(folder) is None
     calls = []
-    real = rehearsal.reconstruct
-    monkeypatch.setattr(rehearsal, "reconstruct", lambda *args, **how: calls.append(1) or real(*args, **how))
+    real = certainty.reconstruct
+    monkeypatch.setattr(certainty, "reconstruct", lambda *args, **how: calls.append(1) or real(*args, **how))
     first = rehearse(done, scan, PRIOR, method, times=2, causes=False, folder=folder)
     more = rehearse(done, scan, PRIOR, method, times=3, causes=False, folder=folder)
     assert len(calls) == 3

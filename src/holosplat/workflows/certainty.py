@@ -1,22 +1,30 @@
-"""Errors of a reconstruction's numbers, factors of their intervals, and the probability that a voxel is matter."""
+"""Errors of a reconstruction's numbers, factors of their intervals, the probability that a voxel is matter, and
+reconstructions like one that was made."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ..checks import require, shaped
 from ..geometry import Grid
+from ..matter import MaterialPrior
+from ..methods import Method
+from ..methods.illumination import CORRELATED, STAGE
 from ..metrics import robust_material_delta, volume_scores
 from ..metrics.volumes import require_same_grid
+from ..optics.background import LightOptions
+from ..scan import Scan
 from ..tables import read_table
 from ..volume import Volume
 from .evaluate import of_absorption
+from .reconstruct import reconstruct
 from .reconstruction import Reconstruction
 
 FACTORS = Path(__file__).with_name("conformal.toml")
@@ -95,6 +103,25 @@ def _centre(delta: np.ndarray) -> np.ndarray:
     weight = weight if weight.any() else np.ones_like(weight)
     axes = [weight.sum(axis=tuple(b for b in range(3) if b != a)) for a in range(3)]
     return np.array([float(np.average(np.arange(len(w)), weights=w)) for w in axes])
+
+
+@dataclass(frozen=True)
+class Again:
+    """Reconstructs other frames as a run did, with what it decided on matter and light."""
+
+    prior: MaterialPrior
+    method: Method
+    seed: int
+    done: Reconstruction
+
+    def __call__(self, scan: Scan, further: int = 0, **changed: Any) -> Reconstruction:
+        """The reconstruction of the training frames of `scan`, with another seed and what is `changed` of it."""
+        done = self.done
+        taken = next((each.choice for each in reversed(done.choice.decisions) if each.name == STAGE), "")
+        light = replace(done.light, noise="correlated" if CORRELATED in taken else "white")
+        light = light if done.still is None else LightOptions()  # which finds the fixed pattern, too
+        how = {"prior": self.prior, "method": self.method, "light": light, "matter": done.choice.matter}
+        return reconstruct(scan, seed=self.seed + further, **(how | changed))
 
 
 BINS = np.linspace(-0.5, 1.5, 41)

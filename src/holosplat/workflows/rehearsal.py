@@ -13,28 +13,27 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from ..beamline.simulate import Simulation, simulated_frames
+from ..beamline.simulate import Simulation, simulate, simulated_frames
 from ..checks import InputError, as_written, require
 from ..geometry import Grid, rotation_y
 from ..inference import Decision
 from ..io.volumes import read_volume, write_volume
 from ..matter import MaterialPrior
 from ..methods import Auto, Method
-from ..methods.illumination import CORRELATED, STAGE
 from ..metrics import robust_material_delta
-from ..optics.background import LightOptions
 from ..optics.noise_model import NoiseModel
 from ..progress import Progress
 from ..representations import InMotion
 from ..scan import Exposures, Scan
 from ..units import in_percent, two_digits
-from ..volume import Volume
+from ..volume import Object, Volume
 from .certainty import (
     LEVEL,
     MATTER,
     SIGNED,
     SIZES,
     VOXELS,
+    Again,
     MatterMap,
     centre_and_scale,
     errors_of,
@@ -207,7 +206,9 @@ class Rehearsal:
             low, high = (self.total / (1 + end) if end > -1 else math.inf for end in reversed(ends["total"]))
             said = f"{low:.3g} to {high:.3g} m³ {self._told('total')}"
             lines.append(f"total {self.quantity} {self.total:.3g} m³: {said}")
-        for name, said in (("delta", f"mean {self.quantity} in the matter"), ("volume", "volume of the matter")):
+        named = [("total", f"total {self.quantity}")] if self.total is None else []
+        named += [("delta", f"mean {self.quantity} in the matter"), ("volume", "volume of the matter")]
+        for name, said in named:
             low, high = (in_percent(abs(end)) for end in ends[name])
             lines.append(f"{said}: up to {low} too low or {high} too high {self._told(name)}")
         expected = "" if self.found is None else f"; expected by the map of matter: {self.matter.expected_dice:.2f}"
@@ -299,21 +300,16 @@ def rehearse(
         kept = Rehearsal(bins, coarse.views.finest, judged.verdict, (), unit, told, stated, quantity)
         if folder is not None:
             write_volume(folder.path / FOUND, told)
-    noise, factor = _noise_and_light(done, coarse.train())
+    train = coarse.train()
+    noise, factor = _noise_and_light(done, train)
     while len(kept.runs) < times:
         number = len(kept.runs)
         on_progress(f"rehearsal {number + 1} of {times}", number / times)
-        turned = _turned(coarse.train(), np.random.default_rng([seed, number]).uniform(0, 360))
-        quiet = _quiet(done, turned.exposures)
+        turned = _turned(train.exposures, np.random.default_rng([seed, number]).uniform(0, 360))
+        quiet = _quiet(done, turned)
         drawn = quiet * factor + noise.drawn(seed + number).numpy() * np.sqrt(np.clip(quiet, 0, None))
-        found = again(replace(turned, frames=drawn.astype(np.float32)), number + 1)
-        assert found.verdict is not None
-        run = errors_of(found, truth) | {
-            **occupancy_counts(_told(done, found.object.voxelise(grid)), _told(done, truth)),
-            RESIDUAL: residual_by_band(found.verdict).tolist(),
-            "cause": found.verdict.cause,
-        }
-        kept = replace(kept, runs=(*kept.runs, run))
+        found = again(replace(train, exposures=turned, frames=drawn.astype(np.float32)), number + 1)
+        kept = replace(kept, runs=(*kept.runs, _shown_by(found, truth)))
         _keep(folder, kept)
     if causes and kept.cause is None and kept.doubtful:
         kept = replace(kept, cause=compare_causes(coarse, again, on_progress))
@@ -322,23 +318,39 @@ def rehearse(
     return kept
 
 
-@dataclass(frozen=True)
-class Again:
-    """Reconstructs other frames as a run did, with what it decided on matter and light."""
+def foresee(
+    matter: Object,
+    exposures: Exposures,
+    photons: float,
+    prior: MaterialPrior,
+    method: Method,
+    *,
+    times: int = 8,
+    on_progress: Progress = lambda stage, fraction: None,
+) -> Rehearsal:
+    """What rehearsals of an experiment show before it is made: the same as of a run, but with known `matter`, and
+    frames of `photons` a pixel in even light. The verdict is that on the first of them. Errors: as of `rehearse`."""
+    require(times >= FEWEST, f"times must be {FEWEST} rehearsals or more, but it is {times}; a spread needs two.")
+    truth, all_train = matter.voxelise(Grid.of_views(exposures.views)), np.zeros(len(exposures), dtype=bool)
+    verdicts, runs = list[Verdict](), list[Mapping[str, Any]]()
+    for number in range(times):
+        on_progress(f"rehearsal {number + 1} of {times}", number / times)
+        turned = _turned(exposures, np.random.default_rng([0, number]).uniform(0, 360))
+        scan = simulate(matter, turned, photons_per_pixel=photons, seed=number, is_test=all_train)
+        found = reconstruct(scan, prior, method, seed=number)
+        assert found.verdict is not None
+        verdicts.append(found.verdict)
+        runs.append(_shown_by(found, truth))
+    on_progress("rehearsals", 1.0)
+    return Rehearsal(1, exposures.views.finest, verdicts[0], tuple(runs), robust_material_delta(truth))
 
-    prior: MaterialPrior
-    method: Method
-    seed: int
-    done: Reconstruction
 
-    def __call__(self, scan: Scan, further: int = 0, **changed: Any) -> Reconstruction:
-        """The reconstruction of the training frames of `scan`, with another seed and what is `changed` of it."""
-        done = self.done
-        taken = next((each.choice for each in reversed(done.choice.decisions) if each.name == STAGE), "")
-        light = replace(done.light, noise="correlated" if CORRELATED in taken else "white")
-        light = light if done.still is None else LightOptions()  # which finds the fixed pattern, too
-        how = {"prior": self.prior, "method": self.method, "light": light, "matter": done.choice.matter}
-        return reconstruct(scan, seed=self.seed + further, **(how | changed))
+def _shown_by(found: Reconstruction, truth: Volume) -> dict[str, Any]:
+    """What a rehearsal shows of its `truth`."""
+    assert found.verdict is not None
+    counts = occupancy_counts(_told(found, found.object.voxelise(truth.grid)), _told(found, truth))
+    residual = residual_by_band(found.verdict).tolist()
+    return errors_of(found, truth) | counts | {RESIDUAL: residual, "cause": found.verdict.cause}
 
 
 def _told(done: Reconstruction, volume: Volume) -> Volume:
@@ -346,13 +358,13 @@ def _told(done: Reconstruction, volume: Volume) -> Volume:
     return volume if done.delta_told else of_absorption(volume)
 
 
-def _turned(scan: Scan, degrees: float) -> Scan:
-    """A scan whose views are turned by `degrees` about the object: about the line along y through what all look at."""
-    views, by = scan.views, rotation_y([degrees])[0]
+def _turned(exposures: Exposures, degrees: float) -> Exposures:
+    """Views turned by `degrees` about the object: about the line along y through what all look at."""
+    views, by = exposures.views, rotation_y([degrees])[0]
     middle = Grid.of_views(views).centre
     rotations = views.rotations @ by
     shifts = views.shifts + ((rotations - views.rotations) @ middle)[:, :2]
-    return replace(scan, exposures=replace(scan.exposures, views=replace(views, rotations=rotations, shifts=shifts)))
+    return replace(exposures, views=replace(views, rotations=rotations, shifts=shifts))
 
 
 def _quiet(done: Reconstruction, exposures: Exposures) -> np.ndarray:
