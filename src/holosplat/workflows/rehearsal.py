@@ -209,7 +209,7 @@ class Rehearsal:
         named = [("total", f"total {self.quantity}")] if self.total is None else []
         named += [("delta", f"mean {self.quantity} in the matter"), ("volume", "volume of the matter")]
         for name, said in named:
-            low, high = (in_percent(abs(end)) for end in ends[name])
+            low, high = (in_percent(end) for end in (min(1.0, -ends[name][0]), ends[name][1]))
             lines.append(f"{said}: up to {low} too low or {high} too high {self._told(name)}")
         expected = "" if self.found is None else f"; expected by the map of matter: {self.matter.expected_dice:.2f}"
         lengths = [2e6 * self.pixel * max(1.0, math.exp(end)) for end in ends["resolution"]]
