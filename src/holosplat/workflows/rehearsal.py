@@ -74,7 +74,7 @@ class Rehearsal:
     explained: the verdict on the measured frames at these pixels, reconstructed likewise
     runs: [K] tables of `errors_of` and `occupancy_counts`, the `residual` [B] and the likely `cause` of each rehearsal
     unit: the δ, or without δ the β, of the material in the rehearsals; found: what the measured frames gave at these
-    pixels, with β in place of δ where δ is not told; None where it was not kept
+    pixels, with β in place of an unknown δ; None if it was not kept
     total: that the run states [m³], None for none; quantity: of which index
     cause: between the metadata as given, the null, and mistakes in them; None where the residual gave no reason
     """
@@ -354,7 +354,7 @@ def _shown_by(found: Reconstruction, truth: Volume) -> dict[str, Any]:
 
 
 def _told(done: Reconstruction, volume: Volume) -> Volume:
-    """A volume with β in place of δ where a run does not tell δ."""
+    """A volume with β in place of δ if a run does not tell δ."""
     return volume if done.delta_told else of_absorption(volume)
 
 
