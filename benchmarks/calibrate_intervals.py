@@ -5,7 +5,9 @@
 
 Scenes are those of `family_scenes`, in turn of every simulated family, on pixels joined 2 × 2 (23 to 30 of them along
 an edge), of 3 to 6 views, reconstructed by linear retrieval or by retrieval of all views with total variation. A run's
-errors against the truth stand beside what its rehearsals say of them. Every fourth scene is also run with a mistake in
+errors against the truth stand beside what its rehearsals say of them. The map of matter of each run is compared with
+the true matter, too (docs/data/matter_map.csv): its probabilities come from rehearsals alone, which no truth enters.
+Every fourth scene is also run with a mistake in
 the metadata: then only the residual over that of the rehearsals counts.
 
 Factors are those of all scenes; the coverage of a family is that by factors of all other families. Frames are simulated
@@ -19,6 +21,7 @@ import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -32,22 +35,24 @@ from rows import machine, merge, read, write
 import holosplat as hs
 from holosplat.geometry import rotation_y
 from holosplat.methods import METHODS
+from holosplat.metrics import dice, robust_material_delta
 from holosplat.scan import Scan
-from holosplat.workflows.rehearsal import (
+from holosplat.workflows.certainty import (
     FACTORS,
     LEVEL,
-    RESIDUAL,
     SIGNED,
     SIZES,
-    Rehearsal,
     centre_and_scale,
     conformal_quantile,
     errors_of,
-    rehearse,
 )
+from holosplat.workflows.rehearsal import RESIDUAL, Rehearsal, rehearse
 
 DATA = Path(__file__).resolve().parents[1] / "docs" / "data"
 PAGE, COVERAGE = DATA / "calibrated_intervals.csv", DATA / "interval_coverage.csv"
+MAP, RELIABILITY = DATA / "matter_map.csv", DATA / "matter_reliability.csv"
+ENDS = (0.0, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98, 1.0)
+"""Of the probabilities that the map is compared at."""
 SEED = 7001
 """Of the first scene; no other script draws scenes of these numbers."""
 VIEWS, WAYS, TIMES, TIMES_OF_MISTAKES = (3, 4, 6), ("ctf-tv", "holographic-tv"), 2, 2
@@ -118,6 +123,8 @@ def rows_of(number: int) -> Iterator[dict[str, Any]]:
         except hs.InputError as refusal:
             yield shared | {"mistake": mistake, "good": f"refused: {refusal}"}
             continue
+        if not mistake:
+            merge(map_rows(shown, truth, shared), MAP, "scene", "low")
         numbers = {} if mistake else _numbers(shown, errors_of(done, truth))
         facts = {"mistake": mistake, "good": shown.explained.good, "excess": f"{shown.excess[0]:.4g}"}
         yield shared | facts | numbers | {"seconds": f"{time.perf_counter() - began:.1f}"}
@@ -130,6 +137,39 @@ def _numbers(shown: Rehearsal, errors: dict[str, float]) -> dict[str, str]:
         for what, value in (("error", errors[name]), ("centre", centre), ("scale", scale)):
             found[f"{name}_{what}"] = f"{value:.5g}"
     return found
+
+
+def map_rows(shown: Rehearsal, truth: hs.Volume, shared: dict[str, Any]) -> list[dict[str, Any]]:
+    """A row for each range of probabilities: its voxels, how many are expected to be matter, and how many are."""
+    chance, matter = shown.matter.values, truth.delta / robust_material_delta(truth) > 0.5
+    found = shown.matter.found.delta / shown.unit > 0.5
+    told = {name: shared[name] for name in ("scene", "family", "method", "views")}
+    told |= {"dice": f"{dice(found, matter):.3f}", "expected_dice": f"{shown.matter.expected_dice:.3f}"}
+    which = np.clip(np.digitize(chance, ENDS) - 1, 0, len(ENDS) - 2)
+    rows = []
+    for n, low in enumerate(ENDS[:-1]):
+        inside = which == n
+        numbers = {"voxels": int(inside.sum()), "expected": f"{chance[inside].sum(dtype=np.float64):.1f}"}
+        rows.append(told | {"low": low} | numbers | {"matter": int(matter[inside].sum())})
+    return rows
+
+
+def reliability() -> None:
+    """Write how often voxels of each range of probabilities are matter, over all scenes, and print it."""
+    rows, lines = read(MAP), list[dict[str, str]]()
+    scenes = sorted({row["scene"] for row in rows})
+    for low, high in pairwise(ENDS):
+        some = [row for row in rows if float(row["low"]) == low]
+        voxels, expected, matter = (sum(float(row[name]) for row in some) for name in ("voxels", "expected", "matter"))
+        if voxels:
+            line = {"from": f"{low:g}", "to": f"{high:g}", "voxels": f"{voxels:.0f}"}
+            line |= {"expected": f"{expected / voxels:.4f}", "matter": f"{matter / voxels:.4f}"}
+            lines.append(line)
+            print(line)
+    write(lines, RELIABILITY)
+    dices = [next((float(r["dice"]), float(r["expected_dice"])) for r in rows if r["scene"] == each) for each in scenes]
+    off = np.diff(np.array(dices), axis=1)
+    print(f"{len(scenes)} maps; Dice expected over true: mean {off.mean():+.3f}, rms {np.sqrt((off**2).mean()):.3f}")
 
 
 def columns_of(rows: Sequence[dict[str, Any]], name: str) -> np.ndarray:
@@ -206,6 +246,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.summary:
         summary()
+        reliability()
         return
     for number in range(options.first, options.scenes):
         if any(row["scene"] == str(number) for row in read(PAGE)):

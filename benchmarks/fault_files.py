@@ -21,10 +21,9 @@ from forked import run
 from holosplat.checks import InputError
 from holosplat.io import read_scan
 from holosplat.io.objects import read_object
-from holosplat.workflows.check import check
 from holosplat.workflows.evaluate import render
 from holosplat.workflows.reconstruct import load_reconstruction
-from holosplat.workflows.run_folder import RunFolder
+from holosplat.workflows.run_folder import RunFolder, check
 
 
 def flipped(shop: Shop, rng: random.Random, folder: Path) -> str:

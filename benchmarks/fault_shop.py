@@ -23,7 +23,7 @@ from holosplat.learning.weights import read_weights
 from holosplat.mesh import TriangleMesh
 from holosplat.specimens.red_cells import random_cells
 from holosplat.training.folder import Dataset
-from holosplat.workflows.check import check
+from holosplat.workflows.run_folder import check
 
 PIXEL, ROWS, COLUMNS = 3.2e-6, 18, 20
 MATERIAL = ["--material", "haemoglobin"]

@@ -444,6 +444,14 @@ def mistakes() -> str:
     )
 
 
+@table("likely", CALIBRATED, "a night", "matter_reliability.csv")
+def matter_map() -> str:
+    """How often voxels of each range of probabilities are matter."""
+    head = ("probability", "voxels", "expected to be matter", "are matter")
+    ranges = [(f"{row['from']} to {row['to']}", row) for row in read("matter_reliability.csv")]
+    return markdown(head, [[name, row["voxels"], row["expected"], row["matter"]] for name, row in ranges])
+
+
 @table("distances", "python benchmarks/distances.py", "an hour", "distances.csv")
 def distances() -> str:
     """Errors of thickness from frames of one view at one, two and four distances, ours beside hotopy's."""

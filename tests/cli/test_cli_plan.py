@@ -169,3 +169,19 @@ def test_flat_objects_are_refused():
     flat = TriangleMesh(np.array([[0, 0, 0], [1e-6, 0, 0], [0, 1e-6, 0.0]]), np.array([[0, 1, 2], [0, 2, 1]]), "leaf")
     with pytest.raises(InputError, match="leaf"):
         Subject(flat, WATER)
+
+
+SMALL = ["--ball", "6e-6", "--pixel-size", "1e-6", "--distance", 0.03, "--views", 3, "--detector", 17, 15]
+
+
+def test_an_experiment_is_rehearsed_before_it_is_made():
+    code, out, _ = command(*SMALL, "--times", 2, "--json")
+    assert code == 0
+    table = json.loads(out)["rehearsal"]
+    low, high = table["intervals_of_errors"]["total"]
+    assert low < 0 < high
+    assert len(table["runs"]) == 2
+    assert any(line.startswith("Dice: at least") for line in table["words"])
+    code, _, err = command(*SMALL, "--times", 1)
+    assert code == 2
+    assert "2 rehearsals or more, but it is 1" in err

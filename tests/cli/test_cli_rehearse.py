@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import shutil
 
+import h5py
+import numpy as np
 import pytest
 
 import holosplat as hs
 from helpers.cli import holosplat, refused, worked
+from holosplat.cli import view
 from holosplat.io.json import read_json, write_json
-from holosplat.workflows import next_step
+from holosplat.show.parts import LEVEL, likely_surfaces
+from holosplat.workflows import next_step, rehearsal
 
 
 @pytest.fixture(scope="module")
@@ -39,9 +43,30 @@ def test_intervals_are_printed_and_kept(run, monkeypatch):
     assert table["word"] in said.out
     assert set(table["intervals_of_errors"]) == {"total", "delta", "volume", "centre", "dice", "error", "resolution"}
     assert "Intervals of " in (run / "report.html").read_text(encoding="utf-8")
+    assert "Where matter is" in (run / "report.html").read_text(encoding="utf-8")
     worked(holosplat("check", run))
     again = worked(holosplat("rehearse", run, "--times", 2))
     assert again.out == said.out
+
+
+def test_the_map_of_matter_is_exported_and_viewed(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(next_step, "MISTAKES", {})
+    worked(holosplat("rehearse", run, "--times", 2))
+    likely = rehearsal.matter_of(hs.RunFolder(run))
+    assert likely is not None
+    worked(holosplat("export", run, "--volume", tmp_path / "volume.h5", "--shape", 17, 16, 17))
+    with h5py.File(tmp_path / "volume.h5") as file:
+        assert file["matter"].dtype == np.float32
+        assert file["matter"][()] == pytest.approx(likely.values, abs=1e-6)
+        assert file["views"][()].max() == 3  # one is held out
+    objects, _ = view._objects(run)
+    shown = [label for label in objects if label]
+    assert shown == list(likely_surfaces(likely))
+    assert shown
+    for label in shown:
+        level = float(label.split("%")[0].split()[-1]) / 100
+        cut = objects[label].voxelise(likely.found.grid).delta >= LEVEL
+        assert np.array_equal(cut, likely.values >= np.float32(level))
 
 
 def test_bad_input_is_refused(run, tmp_path):

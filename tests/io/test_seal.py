@@ -22,7 +22,7 @@ from holosplat.io.hdf5_writing import new_hdf5, put
 from holosplat.io.nxtomo import write_scan
 from holosplat.io.seal import ENDING, MAGIC, require_sealed, seal, summed
 from holosplat.scan import Exposures, Scan
-from holosplat.workflows.check import check
+from holosplat.workflows.run_folder import check
 
 PIXEL = 3.2e-6
 

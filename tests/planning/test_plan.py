@@ -14,7 +14,7 @@ from holosplat.geometry import Views
 from holosplat.materials import HAEMOGLOBIN, PLASMA, RED_CELL, WATER, Compound, DeltaBeta
 from holosplat.model import measure
 from holosplat.planning.contrast import Setup, Subject, signal_to_noise_squared, visibility
-from holosplat.planning.plan import Recording, crowther_limit, plan, survey
+from holosplat.planning.plan import Recording, crowther_limit, experiment, plan, survey
 from holosplat.report.plan import survey_figure
 from holosplat.scan import Exposures
 from holosplat.specimens.red_cells import evans_fung_cell
@@ -261,3 +261,19 @@ def test_the_figure_shows_the_survey(surveyed):
     assert len(survey_figure(line).axes) == 3
     column = replace(surveyed, distances=surveyed.distances[:1], information=surveyed.information[:, :1])
     assert survey_figure(column).axes[0].get_xlabel() == "photon energy (keV)"
+
+
+def test_the_experiment_of_a_plan_is_as_wide_as_object_and_fringes_on_joined_pixels():
+    """A cell of known sides; the photons of joined pixels add up."""
+    setup = Setup(20.0, 0.1, 0.1e-6)
+    x, y, z = CELL.extent
+    rows, columns = (math.ceil((side + 4 * setup.fringe) / 0.1e-6) for side in (y, math.hypot(x, z)))
+    scene, exposures, photons = experiment(CELL, setup, Recording(100.0, 5), 20)
+    joined = min(rows, columns) // 20
+    assert exposures.views.shape == (rows // joined, columns // joined)
+    assert exposures.views.pixel_size == pytest.approx(joined * 0.1e-6)
+    assert photons == pytest.approx(100 * joined**2)
+    assert len(exposures) == 5
+    assert tuple(scene.materials[0]) == tuple(CELL.contrast(20.0))
+    small = experiment(CELL, setup, Recording(100.0, 5, (11, 19)), 20)[1]
+    assert small.views.shape == (11, 19)

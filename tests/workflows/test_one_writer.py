@@ -20,9 +20,8 @@ from holosplat.io.atomic import atomic_folder, atomic_path, is_taken
 from holosplat.io.hdf5_writing import new_hdf5, put
 from holosplat.io.leftovers import LOCK, host, temporary_name
 from holosplat.io.lock import sole_writer
-from holosplat.workflows.check import check
 from holosplat.workflows.provenance import MANIFEST, faults
-from holosplat.workflows.run_folder import RunFolder, claimed
+from holosplat.workflows.run_folder import RunFolder, check, claimed
 
 
 def lock_of(process: int, machine: str = "", began: str = "1") -> str:

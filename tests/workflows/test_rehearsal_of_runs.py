@@ -7,38 +7,44 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.optimize import isotonic_regression
 
 import holosplat as hs
 from holosplat.geometry import Grid
 from holosplat.inference import Decision
 from holosplat.matter import DeltaBeta, MaterialPrior, Matter
 from holosplat.methods import METHODS
+from holosplat.metrics import dice
 from holosplat.optics import NoiseModel
 from holosplat.optics.background import LightOptions
 from holosplat.representations import VoxelGrid
-from holosplat.workflows import Reconstruction, RunFolder, next_step, rehearsal
-from holosplat.workflows.next_step import MISTAKES, NULL, STEPS, compare_causes
-from holosplat.workflows.rehearsal import (
-    Again,
+from holosplat.volume import Volume
+from holosplat.workflows import Reconstruction, RunFolder, certainty, next_step, rehearsal
+from holosplat.workflows.certainty import (
+    BINS,
     Factor,
-    Rehearsal,
+    MatterMap,
     centre_and_scale,
     conformal_quantile,
     errors_of,
-    read_rehearsal,
-    rehearse,
+    matter_probabilities,
+    occupancy_counts,
 )
+from holosplat.workflows.next_step import MISTAKES, NULL, STEPS, compare_causes
+from holosplat.workflows.rehearsal import Again, Rehearsal, read_rehearsal, rehearse
 from holosplat.workflows.verdict import Verdict
 
 WATER = hs.materials.parse_material("water").delta_beta(20.0)
 PRIOR, PIXEL, SHAPE = hs.MaterialPrior.known(WATER), 1e-6, (20, 23)
 
 
+def cells() -> hs.MeshScene:
+    return hs.MeshScene.of_one_material(hs.specimens.random_cells(2, (16e-6, 16e-6, 16e-6), 5, 9e-6), WATER)
+
+
 def scan_of(count: int, photons: float | None = 20000.0) -> hs.Scan:
     views = hs.Views.evenly_spaced(count, SHAPE, PIXEL)
-    box = (16e-6, 16e-6, 16e-6)
-    scene = hs.MeshScene.of_one_material(hs.specimens.random_cells(2, box, 5, 9e-6), WATER)
-    return hs.simulate(scene, hs.Exposures.of(views, 20.0, 0.03), photons_per_pixel=photons, seed=3)
+    return hs.simulate(cells(), hs.Exposures.of(views, 20.0, 0.03), photons_per_pixel=photons, seed=3)
 
 
 def ball(factor: float = 1.0, move: int = 0) -> VoxelGrid:
@@ -95,7 +101,7 @@ def test_a_biased_method_shows_its_bias_and_an_exact_one_has_none(few, monkeypat
     assert shown.values("error").min() > 0.1
     assert shown.values("dice").min() > 0.01
 
-    monkeypatch.setattr(rehearsal, "reconstruct", lambda *args, **how: done)
+    monkeypatch.setattr(certainty, "reconstruct", lambda *args, **how: done)
     exact = rehearse(done, scan, PRIOR, METHODS["ctf-tv"], times=2, causes=False)
     for name in ("delta", "volume", "centre", "dice", "error"):
         assert np.abs(exact.values(name)).max() < 1e-6
@@ -111,14 +117,31 @@ def test_frames_of_a_rehearsal_are_those_of_the_result_with_noise_of_the_measure
         seen.append(frames)
         return done
 
-    monkeypatch.setattr(rehearsal, "reconstruct", look)
+    monkeypatch.setattr(certainty, "reconstruct", look)
     rehearse(done, scan, PRIOR, METHODS["ctf-tv"], times=2, causes=False)
-    first, second = (each.frames for each in seen)
-    assert first.shape == scan.train().frames.shape
-    noise, level = (first - second) / np.sqrt(2), NoiseModel.of_frames(scan.train().measured).level
-    assert noise.std() == pytest.approx(float(level.square().mean().sqrt()), rel=0.1)
-    predicted = hs.workflows.render(done, scan.train().exposures)
-    assert np.std(0.5 * (first + second) - predicted) == pytest.approx(noise.std() / np.sqrt(2), rel=0.15)
+    level = NoiseModel.of_frames(scan.train().measured).level
+    for each in seen:
+        assert each.frames.shape == scan.train().frames.shape
+        noise = each.frames - hs.workflows.render(done, each.exposures)
+        assert noise.std() == pytest.approx(float(level.square().mean().sqrt()), rel=0.15)
+    first, second = (each.views.rotations for each in seen)
+    assert not np.allclose(first, second)
+    given = scan.train().views.rotations
+    between = [turns[0].T @ turns[1] for turns in (first, second, given)]
+    assert [np.trace(turn) for turn in between] == pytest.approx([np.trace(between[2])] * 3)  # by one angle together
+
+
+def test_views_turn_about_what_they_look_at():
+    """A point there stays where it is on all detectors, and a quarter turn moves one beside it as the axis says."""
+    views = hs.Views.from_angles([0.0, 50.0], (5, 7), PIXEL)
+    middle = np.array([4.0, -2.0, 3.0]) * PIXEL
+    views = replace(views, shifts=(views.rotations @ middle)[:, :2])
+    turned = rehearsal._turned(hs.Exposures.of(views, 20.0, 0.03), 90.0).views
+    assert Grid.of_views(turned).centre == pytest.approx(middle)
+    assert (turned.rotations @ middle)[:, :2] == pytest.approx(turned.shifts)
+    beside = middle + np.array([1.0, 0.0, 0.0]) * PIXEL
+    along = turned.rotations @ beside - np.c_[turned.shifts, (turned.rotations @ middle)[:, 2]]
+    assert along == pytest.approx(views.rotations @ np.array([0.0, 0.0, -1.0]) * PIXEL, abs=1e-15)
 
 
 def test_larger_pixels_are_rehearsed_on_measured_frames_of_such_pixels(few, monkeypatch):
@@ -129,10 +152,72 @@ def test_larger_pixels_are_rehearsed_on_measured_frames_of_such_pixels(few, monk
         seen.append(frames.views.shape)
         return done
 
-    monkeypatch.setattr(rehearsal, "reconstruct", look)
+    monkeypatch.setattr(certainty, "reconstruct", look)
     shown = rehearse(done, scan, PRIOR, METHODS["ctf-tv"], times=2, bins=2, causes=False)
     assert seen == [(10, 11)] * 3
     assert shown.pixel == pytest.approx(2 * PIXEL)
+
+
+def test_turned_views_show_what_one_view_leaves_free(monkeypatch):
+    """Of one view the depth is free. Rehearsed from where it stands, the result seems nearly twice as good as it is."""
+    scan, method = scan_of(1, None), METHODS["ctf-tv"]
+    scan = replace(scan, is_test=np.zeros(1, dtype=bool))
+    done = hs.reconstruct(scan, PRIOR, method)
+    true = errors_of(done, cells().voxelise(Grid.of_views(scan.views)))["error"]
+    turned = rehearse(done, scan, PRIOR, method, times=2, causes=False).values("error")
+    monkeypatch.setattr(rehearsal, "_turned", lambda exposures, degrees: exposures)
+    still = rehearse(done, scan, PRIOR, method, times=2, causes=False).values("error")
+    assert still.max() < 0.75 * true
+    assert np.abs(turned - true).max() < 0.2 * true
+
+
+def test_the_map_of_matter_is_calibrated_on_what_it_was_counted_on(few):
+    """The mean probability over the voxels that were counted is the share of matter among them, but for the prior."""
+    shown = few[2]
+    voxels, matter = (shown.values(name).sum(axis=0) for name in ("voxels", "matter"))
+    table = shown.matter.table
+    assert voxels.sum() == 2 * 20 * 23 * 23
+    assert (np.diff(table) >= 0).all()
+    assert (voxels * table).sum() == pytest.approx(matter.sum(), abs=len(table))
+    assert shown.matter.values.shape == (23, 20, 23)
+    assert 0 < shown.matter.expected_dice < 1
+    assert f"expected by the map of matter: {shown.matter.expected_dice:.2f}" in "".join(shown.lines())
+    with pytest.raises(hs.InputError, match="is not kept; rehearse again"):
+        _ = replace(shown, found=None).matter
+
+
+def test_probabilities_are_the_isotonic_fit_of_shares():
+    """The twin: scipy's weighted isotonic regression; without disorder the shares themselves."""
+    rng = np.random.default_rng(4)
+    voxels = rng.integers(0, 200, 41).astype(float)
+    matter = np.floor(voxels * rng.random(41))
+    twin = isotonic_regression((matter + 0.5) / (voxels + 1), weights=voxels + 1).x
+    assert matter_probabilities(voxels, matter) == pytest.approx(twin, rel=1e-12)
+    rising = matter_probabilities(np.array([9.0, 9.0, 9.0]), np.array([0.0, 4.0, 9.0]))
+    assert rising == pytest.approx([0.05, 0.45, 0.95])
+    with pytest.raises(hs.InputError, match="among those counted"):
+        matter_probabilities(np.ones(2), np.array([1.0, 2.0]))
+
+
+def test_occupancies_of_known_noise_have_the_probabilities_of_bayes():
+    """Matter of occupancy 1 in a third of a box of odd sides, Gaussian noise: p = 1/(1 + 2 exp((1 - 2 o)/(2 σ²)))."""
+    rng, grid, sigma = np.random.default_rng(0), Grid.centred((31, 45, 53), PIXEL), 0.3
+    matter = rng.random(grid.shape) < 1 / 3
+    truth = Volume(1e-7 * matter, 1e-9 * matter, grid)
+    noisy = 1e-7 * (matter + sigma * rng.normal(size=grid.shape))
+    counts = occupancy_counts(Volume(noisy, 0.01 * noisy, grid), truth)
+    table = matter_probabilities(*(np.array(counts[name]) for name in ("voxels", "matter")))
+    middles = 0.5 * (BINS[1:] + BINS[:-1])[1:-1]
+    exact = 1 / (1 + 2 * np.exp((1 - 2 * middles) / (2 * sigma**2)))
+    assert table[1:-1] == pytest.approx(exact, abs=0.05)
+    other = MatterMap(Volume(noisy, noisy, grid), 1e-7, table)
+    both = float(other.values[noisy > 0.5e-7].sum()) * 2 / float((noisy > 0.5e-7).sum() + other.values.sum())
+    assert other.expected_dice == pytest.approx(both)
+    assert other.expected_dice == pytest.approx(dice(noisy > 0.5e-7, matter), abs=0.01)
+    assert other.on(grid) == pytest.approx(other.values, abs=1e-5)
+    finer = Grid.centred((31, 45, 105), PIXEL)
+    between = other.on(replace(finer, voxel_size=(PIXEL / 2, PIXEL, PIXEL), origin=grid.origin))
+    assert between[..., 1::2] == pytest.approx(0.5 * (other.values[..., 1:] + other.values[..., :-1]), abs=1e-5)
 
 
 def made(own: float, left: float, allowed: float, good: bool, cause: Decision | None = None) -> Rehearsal:
@@ -142,6 +227,22 @@ def made(own: float, left: float, allowed: float, good: bool, cause: Decision | 
     said = Verdict(good, "words", (), np.array([[2e-6, np.inf]]), **powers, tested={}, cause="" if good else "mass")
     runs = [{"residual": [left], "cause": ""}, {"residual": [left], "cause": "mass"}]
     return Rehearsal(1, PIXEL, said, tuple(runs), cause=cause)
+
+
+def test_an_experiment_of_more_views_and_photons_is_foreseen_to_be_surer():
+    """Of the same cell; the truth is the mesh, on the grid of odd frames."""
+    cell = hs.specimens.random_cells(1, (14e-6, 14e-6, 14e-6), 1, 9e-6)
+    scene = hs.MeshScene.of_one_material(cell, WATER)
+    errors = []
+    for views, photons in ((3, 1e3), (12, 1e5)):
+        exposures = hs.Exposures.of(hs.Views.evenly_spaced(views, (17, 19), PIXEL), 20.0, 0.03)
+        shown = rehearsal.foresee(scene, exposures, photons, PRIOR, METHODS["ctf-tv"], times=2)
+        assert "total δ: up to" in "".join(shown.intervals())
+        assert shown.interval("error")[1] > shown.values("error").max()
+        errors.append(shown.values("error").mean())
+    assert errors[1] < 0.7 * errors[0]
+    with pytest.raises(hs.InputError, match="2 rehearsals or more"):
+        rehearsal.foresee(scene, exposures, 1e3, PRIOR, METHODS["ctf-tv"], times=1)
 
 
 def test_the_three_words(monkeypatch):
@@ -163,8 +264,8 @@ def test_rehearsals_are_kept_and_only_those_that_are_missing_are_made(tmp_path, 
     done = hs.reconstruct(scan, PRIOR, method, folder=folder)
     assert read_rehearsal(folder) is None
     calls = []
-    real = rehearsal.reconstruct
-    monkeypatch.setattr(rehearsal, "reconstruct", lambda *args, **how: calls.append(1) or real(*args, **how))
+    real = certainty.reconstruct
+    monkeypatch.setattr(certainty, "reconstruct", lambda *args, **how: calls.append(1) or real(*args, **how))
     first = rehearse(done, scan, PRIOR, method, times=2, causes=False, folder=folder)
     more = rehearse(done, scan, PRIOR, method, times=3, causes=False, folder=folder)
     assert len(calls) == 3
@@ -172,6 +273,7 @@ def test_rehearsals_are_kept_and_only_those_that_are_missing_are_made(tmp_path, 
     kept = read_rehearsal(folder)
     assert kept is not None
     assert kept.runs == more.runs
+    assert np.array_equal(kept.matter.values, more.matter.values)
     assert kept.lines() == more.lines()
     table = folder.read_summary()["rehearsal"]
     assert table["word"] == more.word

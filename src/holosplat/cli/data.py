@@ -10,7 +10,7 @@ from tyro.conf import Positional, arg, subcommand
 
 from ..checks import InputError
 from ..io.reading import Reading
-from ..workflows.check import check as look
+from ..workflows.run_folder import check as look
 from .places import Output, with_checked_arguments
 from .sentence import say
 

@@ -64,7 +64,8 @@ def export(
         volume: Volume to write, by its suffix: .h5 or .hdf5, HDF5; .vti, for ParaView and PyVista; .nrrd, for 3D Slicer
             and ITK; .mrc, for ChimeraX; .tif or .tiff, an OME-TIFF; .zarr, a folder of OME-Zarr (extra zarr). NRRD and
             MRC hold δ alone, and β in NAME.beta.nrrd or NAME.beta.mrc. Of absorption alone µ [1/m] stands in δ's place.
-            HDF5 also holds /views, the number of training views that show each voxel, if the run's scan is there.
+            HDF5 also holds /views, the number of training views that show each voxel, if the run's scan is there; and
+            of a rehearsed run /matter, the probability that a voxel is matter.
         shape: Voxels along z, y, x (default: the scan's field of view, Z = X = W, Y = H).
         voxel_size: Edge of a voxel [m] (default: the pixel size).
         bodies: Of a run of surfaces: a folder to make, with one VTK file a body (µm), the largest first, or of a run
@@ -270,6 +271,7 @@ def _export_volume(
     from ..planning.acts import of_export
     from ..scan import PIXEL_RANGE_M
     from ..workflows.export import export as write
+    from ..workflows.rehearsal import matter_of
     from .room import tell
 
     shape, voxel_size = sampling
@@ -284,7 +286,7 @@ def _export_volume(
     require(count <= MOST_VOXELS, f"shape must have at most {MOST_VOXELS:.0e} voxels, but it has {count:.0e}.")
     slabs = ((f"an HDF5 file{how}", of_export(shape, ".h5")) for how, shape in _smaller(grid.shape))
     tell("the volume", of_export(grid.shape, volume.suffix.lower()), volume, slabs)
-    write(result, volume, grid, exposures=_exposures_of(folder, volume, frame))
+    write(result, volume, grid, exposures=_exposures_of(folder, volume, frame), matter=matter_of(folder))
     say(f"wrote {volume}: {' × '.join(map(str, grid.shape))} voxels of {1e6 * grid.voxel_size[0]:.4g} µm")
     return grid
 

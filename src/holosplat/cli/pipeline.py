@@ -76,9 +76,8 @@ class Stage:
 
     def _is_whole(self, out: Place) -> bool:
         """Whether all of an output is there and sound: itself, or a file for each time of the run that is exported."""
-        from ..workflows.check import check
         from ..workflows.reconstruction import instants_of
-        from ..workflows.run_folder import RunFolder
+        from ..workflows.run_folder import RunFolder, check
 
         if is_run(out.path):
             run = RunFolder(out.path)

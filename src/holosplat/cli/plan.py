@@ -12,7 +12,8 @@ from tyro.conf import arg
 
 from ..checks import in_range, require
 from ..planning.contrast import Setup
-from ..planning.plan import Motion, Plan, Recording, Sampling, Storage, Survey, Waves
+from ..planning.plan import Motion, Plan, Recording, Sampling, Storage, Survey, Waves, experiment
+from ..planning.plan import plan as make_plan
 from ..progress import Advance
 from ..ranges import Grams, Many, Metres, Positive, Signed, Small, ranged
 from ..units import in_percent
@@ -24,7 +25,7 @@ from .sentence import say
 if TYPE_CHECKING:
     from ..mesh import TriangleMesh
     from ..planning.contrast import Subject
-    from ..planning.plan import Plan, Survey
+    from ..workflows.rehearsal import Rehearsal
 
 CELL_DIAMETER = 8e-6
 LEVEL = 4
@@ -162,6 +163,7 @@ def plan(
     beam: Setup,
     record: Recording,
     ranges: RangeOptions,
+    times: Many | None = None,
     as_json: Annotated[bool, arg(name="json")] = False,
 ) -> None:
     """Say what an experiment would see, resolve and store, and where its best distance and energy lie.
@@ -169,10 +171,10 @@ def plan(
     Nothing is written before the end: after a plan that was stopped, give the same command again.
 
     Args:
+        times: Also simulate and reconstruct it so many times, and say how sure its numbers would be (2 or more), by
+            retrieval of all views together with total variation.
         as_json: Print JSON instead of a table.
     """
-    from ..planning.plan import plan as make_plan
-
     ranges.check()
     subject = what.subject()
     planned = make_plan(subject, beam, record)
@@ -180,15 +182,32 @@ def plan(
     if ranges.wanted:
         with ProgressBar() as bar:
             surveyed = ranges.run(subject, beam, record.photons_per_pixel, bar.of("surveying"))
+    foreseen = None if times is None else _foreseen(subject, beam, record, times)
     if as_json:
-        print(json.dumps(_as_dict(what.name(), beam, record, planned, surveyed), indent=2, allow_nan=False))
+        found = _as_dict(what.name(), beam, record, planned, surveyed)
+        found |= {} if foreseen is None else {"rehearsal": foreseen.as_dict()}
+        print(json.dumps(found, indent=2, allow_nan=False))
     else:
         print(*_plan_lines(what.name(), beam, record, planned), sep="\n")
         if surveyed is not None:
             print("", *_survey_lines(surveyed), sep="\n")
+        if foreseen is not None:
+            print("", *foreseen.intervals(), sep="\n")
     if surveyed is not None and ranges.out is not None:
         _write(ranges.out, surveyed)
         say(f"wrote {ranges.out} and {ranges.out.with_suffix('.csv')}")
+
+
+def _foreseen(subject: Subject, setup: Setup, recording: Recording, times: int) -> Rehearsal:
+    from ..matter import MaterialPrior
+    from ..methods import METHODS
+    from ..workflows.rehearsal import SIDE, foresee
+
+    scene, exposures, photons = experiment(subject, setup, recording, SIDE)
+    prior = MaterialPrior.known(subject.contrast(setup.energy_kev))
+    with ProgressBar() as bar:
+        method = METHODS["holographic-tv"]
+        return foresee(scene, exposures, photons, prior, method, times=times, on_progress=bar.show)
 
 
 def _as_dict(name: str, setup: Setup, recording: Recording, planned: Plan, surveyed: Survey | None) -> dict[str, Any]:

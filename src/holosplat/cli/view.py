@@ -107,7 +107,8 @@ def view(what: Positional[Path], port: Port = 8080) -> None:
         else:
             from ..show.scene import Scene
 
-            Scene(page).put(objects, words)
+            slider = "time" if all(label.endswith("s") for label in objects) else "shown"
+            Scene(page).put(objects, words, slider)
             say_where(page)
         _until_interrupted()
     except KeyboardInterrupt:
@@ -137,21 +138,23 @@ def _until_interrupted() -> None:
 
 
 def _objects(what: Path) -> tuple[dict[str, Stored], list[str]]:
-    """What the slider of time leads through, by its label, and words on the run."""
+    """What a slider leads through, by its label: times, or a rehearsed run and its likely matter; and words on it."""
     from ..io.compact import SERIES
     from ..io.hdf5 import open_hdf5
     from ..io.objects import read_object, read_series
-    from ..show.parts import at_times
+    from ..show.parts import at_times, likely_surfaces
     from ..show.scene import steps_of
     from ..workflows.reconstruction import instants_of
+    from ..workflows.rehearsal import matter_of
     from ..workflows.run_folder import RunFolder
 
     require(what.exists(), f"{what} must be a run folder or an object file, but there is none; check the path.")
     if what.is_dir():
         folder = RunFolder(what)
         folder.require_run()
-        obj = folder.read_result()
-        return at_times(obj, instants_of(folder)), [obj.described, *steps_of(folder)]
+        obj, matter = folder.read_result(), matter_of(folder)
+        likely = {} if matter is None else likely_surfaces(matter)
+        return at_times(obj, instants_of(folder)) | likely, [obj.described, *steps_of(folder)]
     with open_hdf5(what) as file:
         several = file.attrs.get("format", "") == SERIES
     if several:

@@ -34,7 +34,7 @@ from .reading import Reading
 from .stacks import all_images
 from .stored_frames import Mended, with_fields
 from .table import Table
-from .volumes import REFRACTION, VOXEL_RANGE_M, Contents, Stored, ViewCount, read_stored, write_voxels
+from .volumes import ALONE, REFRACTION, VOXEL_RANGE_M, Beside, Contents, Stored, read_stored, write_voxels
 from .vti import read_vti, write_vti
 
 SOURCE, SUMMARY = "source.json", "summary.json"
@@ -261,14 +261,14 @@ def write_volume_file(
     grid: Grid,
     on_progress: Advance = lambda fraction: None,
     of: Contents = REFRACTION,
-    seen: ViewCount | None = None,
+    beside: Beside = ALONE,
 ) -> None:
     """Write δ and β (or what arrays are `of`) of `obj` on `grid` in the format that the suffix of `path` names.
 
-    seen: what counts the views that show each voxel; of the formats only HDF5 holds that.
+    beside: what more to write of each voxel; of the formats only HDF5 holds that.
     """
-    if seen is not None and path.suffix.lower() in HDF5_SUFFIXES:
-        write_voxels(path, obj, grid, on_progress, of, seen)
+    if beside and path.suffix.lower() in HDF5_SUFFIXES:
+        write_voxels(path, obj, grid, on_progress, of, beside)
     else:
         volume_format(path).write(path, obj, grid, on_progress, of)
 

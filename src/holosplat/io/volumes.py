@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,10 +24,12 @@ SAID = {"voxel_size_units": "m", "origin_units": "m", "axes": "z, y, x"}
 """Attributes for people and other programs; lengths are (x, y, z)."""
 MU = "mu_per_m"
 """The attenuation coefficient, which stands in place of δ where that is not known."""
-SEEN = "views"
-"""How many views show each voxel."""
-ViewCount = Callable[[Grid], np.ndarray]
-"""The number of views that show each voxel of a grid, [Z, Y, X]."""
+SEEN, LIKELY = "views", "matter"
+"""How many views show each voxel, and the probability that it is matter."""
+Beside = Mapping[str, Callable[[Grid], np.ndarray]]
+"""What stands beside δ and β, by these names: numbers of the voxels of a grid, [Z, Y, X]."""
+ALONE: Beside = {}
+"""No more than δ and β."""
 SLAB_VOXELS = 1 << 22
 """Voxels that `write_voxels` makes at once: meshes take about 250 MB for them."""
 
@@ -156,27 +158,27 @@ def write_slabs(
     grid: Grid,
     slabs: Iterable[tuple[int, Volume]],
     of: Contents = REFRACTION,
-    seen: ViewCount | None = None,
+    beside: Beside = ALONE,
 ) -> None:
     """Write the volume on `grid` from its parts `slabs`, each with the y index of its first slice.
 
     Attributes say units and axes, too. The parts must cover the grid; `path` is replaced only once all are written.
-    seen: what counts the views that show each voxel, for /views.
+    beside: what more the file holds of each voxel.
     """
     attributes = {"voxel_size": np.array(grid.voxel_size), "origin": np.array(grid.origin), **SAID}
-    with new_hdf5(path, (4 * len(NAMES) + 2 * (seen is not None)) * math.prod(grid.shape)) as file:
+    with new_hdf5(path, 4 * (len(NAMES) + len(beside)) * math.prod(grid.shape)) as file:
         file.attrs.update(attributes)
         chunk = (grid.shape[0], 1, grid.shape[2])  # slabs are whole in z and x
-        units = of.units | ({} if seen is None else {SEEN: "1"})
-        types = dict.fromkeys(of.units, np.float32) | {SEEN: np.uint16}
+        units = of.units | dict.fromkeys(beside, "1")
+        types = dict.fromkeys(units, np.float32) | {SEEN: np.uint16}
         arrays = {name: room_for(file, name, grid.shape, types[name], chunk=chunk) for name in units}
         for name, array in arrays.items():
             array.attrs.update({**attributes, "units": units[name]})
             for dimension, axis in zip(array.dims, "zyx"):
                 dimension.label = axis
         for start, part in slabs:
-            counted = {} if seen is None else {SEEN: seen(part.grid)}
-            for name, values in (of.of_volume(part) | counted).items():
+            more = {name: of_grid(part.grid) for name, of_grid in beside.items()}
+            for name, values in (of.of_volume(part) | more).items():
                 arrays[name][:, start : start + part.grid.shape[1]] = values
 
 
@@ -186,14 +188,14 @@ def write_voxels(
     grid: Grid,
     on_progress: Advance = lambda fraction: None,
     of: Contents = REFRACTION,
-    seen: ViewCount | None = None,
+    beside: Beside = ALONE,
 ) -> None:
     """Write `obj` voxelised on `grid`, slab by slab; at most `SLAB_VOXELS` voxels are in memory, however large the
     grid.
 
-    `on_progress(fraction)` is called after each slab. seen: as of `write_slabs`.
+    `on_progress(fraction)` is called after each slab. beside: as of `write_slabs`.
     """
-    write_slabs(path, grid, slabs_of(obj, grid, slab_rows(grid), on_progress), of, seen)
+    write_slabs(path, grid, slabs_of(obj, grid, slab_rows(grid), on_progress), of, beside)
 
 
 def slab_rows(grid: Grid) -> int:

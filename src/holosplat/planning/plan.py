@@ -1,10 +1,11 @@
-"""The plan of an experiment: contrast, resolution, motion and data, before any simulation. Pure arithmetic on
-`contrast`."""
+"""The plan of an experiment: contrast, resolution, motion and data, before any simulation: arithmetic on
+`contrast`. `experiment` is what a simulation of it takes."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,7 +13,11 @@ from ..checks import in_range, positive, require
 from ..geometry import Grid, Views
 from ..progress import Advance
 from ..ranges import Frequency, Natural, Photons, Seconds, ranged
+from ..scan import Exposures
 from .contrast import Setup, Subject, Visibility, visibility
+
+if TYPE_CHECKING:
+    from ..specimens.scene import MeshScene
 
 WANTED_SNR = 5.0
 """Signal to noise of a certain detection (Rose 1948, J. Opt. Soc. Am. 38, 196)."""
@@ -258,6 +263,22 @@ def _storage(setup: Setup, recording: Recording) -> Storage:
     shape = Grid.of_views(Views.evenly_spaced(1, (rows, columns), setup.pixel_size)).shape
     volume = float(BYTES_A_VOXEL * math.prod(shape))
     return Storage(rate, instant * recording.frames, shape, volume, volume * recording.frames)
+
+
+def experiment(subject: Subject, setup: Setup, recording: Recording, side: int) -> tuple[MeshScene, Exposures, float]:
+    """The object, its exposures, and their photons a pixel: of the detector, but no more of it than holds the object
+    and four fringes at any turn about y, on pixels joined until `side` of them lie along the shorter side."""
+    from ..specimens.scene import MeshScene  # with torch, which takes long to load
+
+    x, y, z = subject.extent
+    field = np.array([y, math.hypot(x, z)]) + 4 * setup.fringe
+    pixels = np.minimum(np.ceil(field / setup.pixel_size), recording.detector or np.inf).astype(int)
+    joined = max(1, int(pixels.min()) // side)
+    rows, columns = (max(1, int(n) // joined) for n in pixels)
+    views = Views.evenly_spaced(recording.views, (rows, columns), joined * setup.pixel_size)
+    exposures = Exposures.of(views, setup.energy_kev, setup.distance, setup.blur_px / joined)
+    scene = MeshScene.of_one_material([subject.mesh], subject.contrast(setup.energy_kev))
+    return scene, exposures, recording.photons_per_pixel * joined**2
 
 
 @dataclass(frozen=True)

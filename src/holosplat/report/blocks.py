@@ -17,6 +17,7 @@ from .curves import correlation_figure, histogram_figure, history_figure
 from .figures import (
     evenly_chosen,
     held_out_figure,
+    matter_block,
     plane_sizes,
     projections_figure,
     richest_planes,
@@ -72,6 +73,8 @@ def make_blocks(content: ReportContent) -> list[Block]:
     first += [] if content.forecast is None else [forecast_block(content.forecast)]
     drawn = [make(content) for make in makers]
     guessed = [] if content.guess is None else [guess_block(content.guess)]
+    if (found := content.rehearsal) is not None and found.found is not None:
+        guessed.insert(0, matter_block(found.matter))
     after = makers.index(_slices) + 1
     for block in (*first, *drawn[:after], *guessed, *drawn[after:]):
         number += block.drawn

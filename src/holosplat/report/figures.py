@@ -1,6 +1,9 @@
-"""The pictures: surfaces, held-out views, projections, slices, banner. Each function returns a figure."""
+"""The pictures: surfaces, held-out views, projections, slices, likely matter."""
 
 from __future__ import annotations
+
+import math
+from collections.abc import Mapping
 
 import matplotlib
 import numpy as np
@@ -11,8 +14,9 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from ..geometry import Grid
-from ..units import length_unit, plain, wavenumber
+from ..units import in_percent, length_unit, plain, wavenumber
 from ..volume import Volume
+from ..workflows.certainty import MatterMap
 from .content import DELTA, HeldOutViews, ProjectedMaps, Quantity, pixel_of
 from .style import (
     BETA_MAP,
@@ -23,14 +27,17 @@ from .style import (
     SIGNED_MAP,
     TRUE_SURFACE,
     WIDTH,
+    Block,
     PanelGrid,
     decimal_scale,
+    drawn_block,
     from_dark,
     grey_limits,
     image_panel,
     largest,
     letter,
     scale_bar,
+    scientific,
     styled,
 )
 from .surface import Deviation, SurfaceImage, box_edges, camera, render_surface
@@ -225,6 +232,37 @@ def slices_figure(
     return panels.figure
 
 
+LIKELY = {0.1: "dotted", 0.5: "solid", 0.9: "dashed"}
+"""Probabilities of matter that contours are drawn at, with their styles."""
+
+
+@styled
+def matter_figure(found: MatterMap) -> Figure:
+    """The probability that a voxel is matter, in the three planes with most of it, with contours at `LIKELY`."""
+    values, grid = found.values, found.found.grid
+    planes = richest_planes(Volume(values, values, grid))
+    panels = PanelGrid(1, *plane_sizes(grid), (2,))
+    drawn = slice_row(panels.axes[0], values, grid, planes, DELTA_MAP, (0.0, 1.0), values, levels=LIKELY)
+    slice_titles(panels.axes[0], 0, "Matter", grid, planes)
+    panels.bar(drawn, 2, (0, 0), "probability of matter")
+    return panels.figure
+
+
+def matter_block(found: MatterMap) -> Block:
+    """The figure with its caption."""
+    values = found.values.astype(np.float64)
+    cell = math.prod(found.found.grid.voxel_size)
+    unsure = float(((values > min(LIKELY)) & (values < max(LIKELY))).sum())
+    text = (
+        "The probability that a voxel is matter, by how often voxels of its value were matter in the rehearsals, in "
+        "the planes with most of it. Contours: dotted, 10 %; solid, 50 %; dashed, 90 %. "
+        f"Expected are {scientific(values.sum() * cell)} m³ of matter; {in_percent(unsure / values.size)} of the "
+        f"volume lies between 10 % and 90 %. The Dice coefficient expected of what exceeds half of the "
+        f"material's value is {found.expected_dice:.2f}."
+    )
+    return drawn_block("Where matter is", text, "The probability of matter.", matter_figure(found))
+
+
 def richest_planes(volume: Volume) -> tuple[int, int, int]:
     """Voxel positions (z, y, x) of the planes with the most matter (largest Σ|δ|)."""
     mass = np.abs(volume.delta)
@@ -251,9 +289,11 @@ def slice_row(
     colours: str,
     limits: tuple[float, float],
     seen: np.ndarray | None = None,
+    *,
+    levels: Mapping[float, str] = {0.5: "dashed"},
 ) -> AxesImage:
-    """Draw the three orthogonal planes of `values` [Z, Y, X] at voxel `positions` (z, y, x), and what encloses those
-    that are `seen` [Z, Y, X] bool."""
+    """Draw the three orthogonal planes of `values` [Z, Y, X] at voxel `positions` (z, y, x), and contours of `seen`
+    [Z, Y, X], bool or numbers, at `levels`, each with the style of its line."""
     edge = dict(zip("xyz", grid.voxel_size))
     widths, _ = plane_sizes(grid)
     for panel, (_, axis, (across, down)), width in zip(axes, PLANES, widths):
@@ -261,11 +301,14 @@ def slice_row(
         drawn = image_panel(panel, plane, (edge[across], edge[down]), colours, limits)
         ink = "white" if colours != SIGNED_MAP else "black"
         scale_bar(panel, width, ink)
-        if seen is not None and len(np.unique(inside := _slice(seen, axis, positions[axis]))) > 1:
-            inside = np.pad(inside, 1, mode="edge")  # contours want two rows
+        if seen is None:
+            continue
+        inside = np.pad(_slice(seen, axis, positions[axis]), 1, mode="edge")  # contours want two rows
+        if drawn_at := [level for level in sorted(levels) if inside.min() < level < inside.max()]:
             i, j = ((np.arange(n) - 0.5) * edge[name] for n, name in zip(inside.shape, (down, across)))
             panel.autoscale(False)
-            panel.contour(j, i, inside, levels=[0.5], colors=ink, linewidths=0.7, linestyles="dashed")
+            styles = [levels[level] for level in drawn_at]
+            panel.contour(j, i, inside, levels=drawn_at, colors=ink, linewidths=0.7, linestyles=styles)
     return drawn
 
 

@@ -11,9 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from ..geometry import Grid
 from ..io.solids import opacities
+from ..matter import Matter
 from ..mesh import TriangleMesh
-from ..representations import GaussianCloud, InMotion, Stored, SurfaceMesh, isosurface
+from ..representations import GaussianCloud, InMotion, Stored, SurfaceMesh, VoxelGrid, isosurface
 from ..units import bar_length, format_length
+from ..workflows.certainty import MatterMap
 
 HALF_EDGE = 10.0
 """Units of the scene from its middle to its farthest side, which suits the cameras of viewers."""
@@ -28,6 +30,8 @@ COLOUR = (205, 80, 60)
 """Of surfaces."""
 LEVEL = 0.5
 """Share of the largest |δ| at which that is."""
+SURE = (0.9, 0.5, 0.1)
+"""Probabilities of matter whose surfaces are shown."""
 TIMES = 48
 """Steps of the slider of time, at most."""
 
@@ -92,6 +96,21 @@ def at_times(obj: Stored, times: Sequence[float]) -> dict[str, Stored]:
     chosen = np.array(times) if len(times) else np.linspace(basis.first, basis.last, TIMES)
     chosen = chosen[np.unique(np.linspace(0, len(chosen) - 1, min(TIMES, len(chosen))).astype(int))]
     return {f"{1e6 * t:.6g} µs": obj.at(float(t)) for t in chosen}
+
+
+def likely_surfaces(found: MatterMap) -> dict[str, Stored]:
+    """The surfaces within which a voxel is matter with the probabilities `SURE` or more, by what a slider says of each,
+    without those that no voxel reaches; each as voxels that `LEVEL` cuts there."""
+    values, most = found.values, float(found.values.max())
+    return {
+        f"matter with a probability of {level:.0%} or more": VoxelGrid(
+            torch.from_numpy(np.interp(values, [0, level, most], [0, LEVEL, 1])[None].astype(np.float32)),
+            found.found.grid,
+            Matter.one(1.0, 0.0),
+        )
+        for level in SURE
+        if level < most
+    }
 
 
 def legend(part: Shown) -> tuple[str, str]:

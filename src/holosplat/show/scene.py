@@ -34,8 +34,8 @@ class Scene:
         self._now = {"time": 0, "cut": 0}
         self._lock = threading.Lock()  # sliders are moved in another thread
 
-    def put(self, objects: Mapping[str, Stored], words: Sequence[str]) -> None:
-        """Show `objects`, by what the slider of time says of each, and words below the title."""
+    def put(self, objects: Mapping[str, Stored], words: Sequence[str], slider: str = "time") -> None:
+        """Show `objects`, by what the `slider` says of each, and words below the title."""
         with self._lock:
             first = not self._objects
             self._objects, self._words, self._parts = objects, words, {}
@@ -43,7 +43,7 @@ class Scene:
                 self._page.frame = Frame.around(next(iter(objects.values())).enclosing_grid(BOX))
             self._draw()
         if first and len(objects) > 1:
-            self._page.slider("time", len(objects), lambda k: self._move(time=k))
+            self._page.slider(slider, len(objects), lambda k: self._move(time=k))
         if first:
             self._page.slider("cut along z", CUTS, lambda k: self._move(cut=k))
 

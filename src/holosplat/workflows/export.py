@@ -7,9 +7,11 @@ from pathlib import Path
 
 from ..geometry import Grid
 from ..io.formats import write_volume_file
+from ..io.volumes import LIKELY, SEEN
 from ..optics.sampling import views_seeing
 from ..progress import Advance
 from ..scan import Exposures
+from .certainty import MatterMap
 from .reconstruction import Reconstruction
 
 
@@ -19,14 +21,16 @@ def export(
     grid: Grid,
     on_progress: Advance = lambda fraction: None,
     exposures: Exposures | None = None,
+    matter: MatterMap | None = None,
 ) -> None:
     """Write δ and β of a reconstruction on `grid` to `path`, whose suffix names the format.
 
     Suffixes: .h5 or .hdf5 (HDF5), .vti (ParaView), .nrrd (3D Slicer), .mrc (ChimeraX), .tif or .tiff (OME-TIFF), .zarr
     (OME-Zarr, a folder). If the frames show absorption alone, the file holds the attenuation coefficient µ [1/m] in
     place of δ. `on_progress(fraction)` is called after each part of the volume. exposures: of the training frames; HDF5
-    then also holds /views, the number of views that show each voxel. Errors: `InputError` for another
-    suffix, and where the package of a format is missing.
+    then also holds /views, the number of views that show each voxel. matter: of rehearsals; HDF5 then also holds
+    /matter, the probability that a voxel is matter. Errors: `InputError` for another suffix, and where the package of a
+    format is missing.
 
     Examples:
 
@@ -41,5 +45,6 @@ def export(
         >>> print(hs.info("cell.vti").rows["shape"])
         16 × 16 × 16 voxels (z, y, x)
     """
-    seen = None if exposures is None else partial(views_seeing, exposures)
-    write_volume_file(Path(path), reconstruction.object, grid, on_progress, reconstruction.contents, seen)
+    beside = {} if exposures is None else {SEEN: partial(views_seeing, exposures)}
+    beside |= {} if matter is None else {LIKELY: matter.on}
+    write_volume_file(Path(path), reconstruction.object, grid, on_progress, reconstruction.contents, beside)

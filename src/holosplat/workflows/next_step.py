@@ -73,7 +73,7 @@ RANGE = 3.0
 
 
 class Again(Protocol):
-    """Reconstructs other frames as a run did (`rehearsal.Again`)."""
+    """Reconstructs other frames as a run did (`certainty.Again`)."""
 
     @property
     def prior(self) -> MaterialPrior:

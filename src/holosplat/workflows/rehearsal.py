@@ -1,35 +1,46 @@
 """Rehearsal: frames of a result are simulated and reconstructed in the same way, which shows bias and spread of each
 number, and the residual that the method leaves of frames whose matter it has found (a parametric bootstrap; Efron &
-Tibshirani 1993, chapter 6)."""
+Tibshirani 1993, chapter 6). In each the views stand at other angles about the result, so that it has parts that they do
+not show (equivariant bootstrap; Tachella & Pereyra 2024, AISTATS)."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cache
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
 
-from ..beamline.simulate import Simulation, simulated_frames
+from ..beamline.simulate import Simulation, simulate, simulated_frames
 from ..checks import InputError, as_written, require
-from ..geometry import Grid
+from ..geometry import Grid, rotation_y
 from ..inference import Decision
+from ..io.volumes import read_volume, write_volume
 from ..matter import MaterialPrior
 from ..methods import Auto, Method
-from ..methods.illumination import CORRELATED, STAGE
-from ..metrics import volume_scores
-from ..optics.background import LightOptions
+from ..metrics import robust_material_delta
 from ..optics.noise_model import NoiseModel
 from ..progress import Progress
 from ..representations import InMotion
-from ..scan import Scan
-from ..tables import read_table
+from ..scan import Exposures, Scan
 from ..units import in_percent, two_digits
-from ..volume import Volume
+from ..volume import Object, Volume
+from .certainty import (
+    LEVEL,
+    MATTER,
+    SIGNED,
+    SIZES,
+    VOXELS,
+    Again,
+    MatterMap,
+    centre_and_scale,
+    errors_of,
+    factors,
+    matter_probabilities,
+    occupancy_counts,
+)
 from .evaluate import of_absorption
 from .next_step import NULL, compare_causes, next_step
 from .reconstruct import reconstruct
@@ -42,86 +53,12 @@ SIDE = 48
 """Pixels along the shorter side of the frames of a rehearsal, about: a reconstruction then takes seconds."""
 FEWEST = 2
 """Rehearsals that have a spread."""
-FACTORS = Path(__file__).with_name("conformal.toml")
-"""Factors of stated errors, with the scenes that they are of: benchmarks/calibrate_intervals.py."""
-LEVEL = 0.9
-"""Part of the calibration's scenes whose truth lies in an interval."""
 ENTRY = "rehearsal"
 """The entry of summary.json."""
-Word = Literal["consistent", "limited", "wrong"]
-
-
-@dataclass(frozen=True)
-class Factor:
-    """How a quantity of rehearsals becomes an interval that holds the truth in `LEVEL` of the calibration's scenes.
-
-    floor: median of the quantity's scale over the scenes, added to that of a run: a scale near 0 promises too much
-    (Papadopoulos et al. 2008, normalised nonconformity); factor: of the sum of both
-    """
-
-    floor: float
-    factor: float
-    scenes: int
-
-
-@cache
-def factors() -> Mapping[str, Factor]:
-    """The table of the calibration, by quantity."""
-    return {name: Factor(**entry) for name, entry in read_table(FACTORS).items()}
-
-
-def conformal_quantile(scores: np.ndarray, level: float) -> float:
-    """The ⌈(n + 1) level⌉-th smallest of n scores, which the next one exceeds with a probability of at most 1 - level
-    (Vovk et al. 2005; Lei et al. 2018, section 2.2); infinite for too few."""
-    rank = math.ceil((len(scores) + 1) * level)
-    return float(np.sort(scores)[rank - 1]) if rank <= len(scores) else math.inf
-
-
-SIGNED, SIZES = ("total", "delta", "volume"), ("centre", "dice", "error")
-"""Quantities with errors of either sign, as shares; and sizes of errors: of the centre of mass [pixels], 1 - Dice, and
-the relative error of δ. Beside them stands `resolution`, the logarithm of a length over two pixels."""
+FOUND = "rehearsed.h5"
+"""The volume of the measured frames at the pixels of the rehearsals, in the run folder."""
 RESIDUAL = "residual"
-
-
-def centre_and_scale(name: str, values: np.ndarray) -> tuple[float, float]:
-    """Where a quantity's error is expected by its values in rehearsals [K], and how far off that may be.
-
-    Resolutions at the limit of the sampling have no spread, so that all runs have the same scale.
-    """
-    if name == "resolution":
-        return float(values.mean()), 1.0
-    return 0.0, float(np.sqrt(np.square(values).mean()))
-
-
-def errors_of(found: Reconstruction, truth: Volume) -> dict[str, float]:
-    """The quantities `SIGNED`, `SIZES` and `resolution` of a reconstruction against the true volume on its grid."""
-    volume = found.object.voxelise(truth.grid)
-    volume, truth = (volume, truth) if found.delta_told else (of_absorption(volume), of_absorption(truth))
-    scores, cell = volume_scores(volume, truth), math.prod(truth.grid.voxel_size)
-    stated = None if found.total is None else found.total.value
-    true = float(truth.delta.sum(dtype=np.float64)) * cell
-    size = float(np.abs(truth.delta).sum(dtype=np.float64)) * cell
-    stated = float(volume.delta.sum(dtype=np.float64)) * cell if stated is None else math.copysign(stated, true)
-    widest, resolution = max(truth.grid.shape) / 2, scores.resolution_half_bit
-    periods = 1.0 if resolution is None else min(resolution / (2 * scores.pitch), widest)
-    matter, true_matter = (each.delta / scores.material_delta > 0.5 for each in (volume, truth))
-    return {
-        "total": (stated - true) / size,
-        "delta": scores.delta_deviation,
-        "volume": float(matter.sum()) / float(true_matter.sum()) - 1,
-        "centre": float(np.linalg.norm(_centre(volume.delta) - _centre(truth.delta))),
-        "dice": 1 - scores.dice,
-        "error": scores.relative_error_delta,
-        "resolution": math.log(periods),
-    }
-
-
-def _centre(delta: np.ndarray) -> np.ndarray:
-    """The centre of mass [voxels]; the middle of an empty volume."""
-    weight = np.abs(delta).astype(np.float64)
-    weight = weight if weight.any() else np.ones_like(weight)
-    axes = [weight.sum(axis=tuple(b for b in range(3) if b != a)) for a in range(3)]
-    return np.array([float(np.average(np.arange(len(w)), weights=w)) for w in axes])
+Word = Literal["consistent", "limited", "wrong"]
 
 
 def residual_by_band(found: Verdict) -> np.ndarray:
@@ -135,7 +72,9 @@ class Rehearsal:
 
     binned: pixels of the frames along an edge of one in a rehearsal; pixel: that edge [m]
     explained: the verdict on the measured frames at these pixels, reconstructed likewise
-    runs: [K] tables of `errors_of`, the `residual` [B] and the likely `cause` of each rehearsal
+    runs: [K] tables of `errors_of` and `occupancy_counts`, the `residual` [B] and the likely `cause` of each rehearsal
+    unit: the δ, or without δ the β, of the material in the rehearsals; found: what the measured frames gave at these
+    pixels, with β in place of an unknown δ; None if it was not kept
     total: that the run states [m³], None for none; quantity: of which index
     cause: between the metadata as given, the null, and mistakes in them; None where the residual gave no reason
     """
@@ -144,13 +83,16 @@ class Rehearsal:
     pixel: float
     explained: Verdict
     runs: tuple[Mapping[str, Any], ...]
+    unit: float = 1.0
+    found: Volume | None = None
     total: float | None = None
     quantity: str = "δ"
     cause: Decision | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, ready for JSON, with what they say; `from_dict` reads them."""
-        plain = {"binned": self.binned, "pixel_m": self.pixel, "explained": self.explained.as_dict()}
+        plain = {"binned": self.binned, "pixel_m": self.pixel, "unit": self.unit}
+        plain |= {"explained": self.explained.as_dict()}
         plain |= {"runs": list(self.runs), "total_m3": self.total, "quantity": self.quantity}
         plain |= {"cause": self.cause and self.cause.as_dict()}
         if len(self.runs) < FEWEST:
@@ -159,8 +101,8 @@ class Rehearsal:
         return plain | {"word": self.word, "intervals_of_errors": said, "words": self.lines()}
 
     @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Rehearsal:
-        """What `as_dict` described; `InputError` for anything else."""
+    def from_dict(cls, values: Mapping[str, Any], found: Volume | None = None) -> Rehearsal:
+        """What `as_dict` described, beside the volume that was `found`; `InputError` for anything else."""
         try:
             total, cause = values["total_m3"], values["cause"]
             return cls(
@@ -168,6 +110,8 @@ class Rehearsal:
                 float(values["pixel_m"]),
                 Verdict.from_dict(values["explained"]),
                 tuple({name: _plain(value) for name, value in run.items()} for run in values["runs"]),
+                float(values["unit"]),
+                found,
                 None if total is None else float(total),
                 str(values["quantity"]),
                 None if cause is None else Decision.from_dict(cause),
@@ -185,6 +129,14 @@ class Rehearsal:
         of = factors()[name]
         reach = of.factor * (scale + of.floor)
         return (0.0 if name in SIZES else centre - reach), centre + reach
+
+    @property
+    def matter(self) -> MatterMap:
+        """Where matter is likely; `InputError` where what was found is not kept."""
+        if self.found is None:
+            raise InputError("a map of matter needs the volume that was rehearsed, but it is not kept; rehearse again.")
+        voxels, matter = (self.values(name).sum(axis=0) for name in (VOXELS, MATTER))
+        return MatterMap(self.found, self.unit, matter_probabilities(voxels, matter))
 
     @property
     def excess(self) -> tuple[float, int]:
@@ -254,13 +206,17 @@ class Rehearsal:
             low, high = (self.total / (1 + end) if end > -1 else math.inf for end in reversed(ends["total"]))
             said = f"{low:.3g} to {high:.3g} m³ {self._told('total')}"
             lines.append(f"total {self.quantity} {self.total:.3g} m³: {said}")
-        for name, said in (("delta", f"mean {self.quantity} in the matter"), ("volume", "volume of the matter")):
-            low, high = (in_percent(abs(end)) for end in ends[name])
+        named = [("total", f"total {self.quantity}")] if self.total is None else []
+        named += [("delta", f"mean {self.quantity} in the matter"), ("volume", "volume of the matter")]
+        for name, said in named:
+            low, high = (in_percent(end) for end in (min(1.0, -ends[name][0]), ends[name][1]))
             lines.append(f"{said}: up to {low} too low or {high} too high {self._told(name)}")
+        expected = "" if self.found is None else f"; expected by the map of matter: {self.matter.expected_dice:.2f}"
         lengths = [2e6 * self.pixel * max(1.0, math.exp(end)) for end in ends["resolution"]]
         return [
             *lines,
-            f"Dice: at least {max(0.0, 1 - ends['dice'][1]):.2f} (rehearsals: {1 - self.values('dice').mean():.2f})",
+            f"Dice: at least {max(0.0, 1 - ends['dice'][1]):.2f} (rehearsals: {1 - self.values('dice').mean():.2f}"
+            f"{expected})",
             f"relative error of {self.quantity}: at most {ends['error'][1]:.2f} (rehearsals: "
             f"{self.values('error').mean():.2f})",
             f"centre of mass: within {1e6 * ends['centre'][1] * self.pixel:.2g} µm",
@@ -301,7 +257,8 @@ def rehearse(
     folder: of the run, whose summary.json keeps each rehearsal, so that a later call makes those that are missing
 
     Frames have noise of the measured ones' power, and their light. They are simulated on a raster of their own, several
-    times finer than that of fits, in plain torch; line integrals are those of the result's own representation.
+    times finer than that of fits, in plain torch; line integrals are those of the result's own representation. All
+    views are turned by one random angle about the result, which is as smooth as its own views leave it.
     Rehearsals take decisions on matter and light, poses and distances for exact. Errors: `InputError` for results in
     motion, without matter or verdict, and for fewer than 2 rehearsals.
 
@@ -329,27 +286,30 @@ def rehearse(
     require(bins >= 1, f"bins must be 1 pixel or more, but it is {bins}.")
     coarse = scan.binned(bins)
     again = Again(prior, method, seed, done)
-    truth = done.object.voxelise(Grid.of_views(coarse.views))
+    grid = Grid.of_views(coarse.views)
+    truth = done.object.voxelise(grid)
     require(bool(truth.delta.any()), "a run must have found matter to be rehearsed, but its volume is empty.")
     kept = None if folder is None else read_rehearsal(folder)
-    if kept is None or kept.binned != bins:
+    if kept is None or kept.binned != bins or kept.found is None:
         on_progress("measured frames on larger pixels", 0.0)
         judged = done if bins == 1 else again(coarse)
         assert judged.verdict is not None
         stated, quantity = (None, "δ") if done.total is None else (done.total.value, done.total.quantity)
-        kept = Rehearsal(bins, coarse.views.finest, judged.verdict, (), stated, quantity)
-    quiet, noise, factor = _frames(done, coarse)
+        told = _told(done, judged.object.voxelise(grid))
+        unit = robust_material_delta(_told(done, truth))
+        kept = Rehearsal(bins, coarse.views.finest, judged.verdict, (), unit, told, stated, quantity)
+        if folder is not None:
+            write_volume(folder.path / FOUND, told)
+    train = coarse.train()
+    noise, factor = _noise_and_light(done, train)
     while len(kept.runs) < times:
         number = len(kept.runs)
         on_progress(f"rehearsal {number + 1} of {times}", number / times)
+        turned = _turned(train.exposures, np.random.default_rng([seed, number]).uniform(0, 360))
+        quiet = _quiet(done, turned)
         drawn = quiet * factor + noise.drawn(seed + number).numpy() * np.sqrt(np.clip(quiet, 0, None))
-        found = again(replace(coarse.train(), frames=drawn.astype(np.float32)), number + 1)
-        assert found.verdict is not None
-        run = errors_of(found, truth) | {
-            RESIDUAL: residual_by_band(found.verdict).tolist(),
-            "cause": found.verdict.cause,
-        }
-        kept = replace(kept, runs=(*kept.runs, run))
+        found = again(replace(train, exposures=turned, frames=drawn.astype(np.float32)), number + 1)
+        kept = replace(kept, runs=(*kept.runs, _shown_by(found, truth)))
         _keep(folder, kept)
     if causes and kept.cause is None and kept.doubtful:
         kept = replace(kept, cause=compare_causes(coarse, again, on_progress))
@@ -358,34 +318,67 @@ def rehearse(
     return kept
 
 
-@dataclass(frozen=True)
-class Again:
-    """Reconstructs other frames as a run did, with what it decided on matter and light."""
+def foresee(
+    matter: Object,
+    exposures: Exposures,
+    photons: float,
+    prior: MaterialPrior,
+    method: Method,
+    *,
+    times: int = 8,
+    on_progress: Progress = lambda stage, fraction: None,
+) -> Rehearsal:
+    """What rehearsals of an experiment show before it is made: the same as of a run, but with known `matter`, and
+    frames of `photons` a pixel in even light. The verdict is that on the first of them. Errors: as of `rehearse`."""
+    require(times >= FEWEST, f"times must be {FEWEST} rehearsals or more, but it is {times}; a spread needs two.")
+    truth, all_train = matter.voxelise(Grid.of_views(exposures.views)), np.zeros(len(exposures), dtype=bool)
+    verdicts, runs = list[Verdict](), list[Mapping[str, Any]]()
+    for number in range(times):
+        on_progress(f"rehearsal {number + 1} of {times}", number / times)
+        turned = _turned(exposures, np.random.default_rng([0, number]).uniform(0, 360))
+        scan = simulate(matter, turned, photons_per_pixel=photons, seed=number, is_test=all_train)
+        found = reconstruct(scan, prior, method, seed=number)
+        assert found.verdict is not None
+        verdicts.append(found.verdict)
+        runs.append(_shown_by(found, truth))
+    on_progress("rehearsals", 1.0)
+    return Rehearsal(1, exposures.views.finest, verdicts[0], tuple(runs), robust_material_delta(truth))
 
-    prior: MaterialPrior
-    method: Method
-    seed: int
-    done: Reconstruction
 
-    def __call__(self, scan: Scan, further: int = 0, **changed: Any) -> Reconstruction:
-        """The reconstruction of the training frames of `scan`, with another seed and what is `changed` of it."""
-        done = self.done
-        taken = next((each.choice for each in reversed(done.choice.decisions) if each.name == STAGE), "")
-        light = replace(done.light, noise="correlated" if CORRELATED in taken else "white")
-        light = light if done.still is None else LightOptions()  # which finds the fixed pattern, too
-        how = {"prior": self.prior, "method": self.method, "light": light, "matter": done.choice.matter}
-        return reconstruct(scan, seed=self.seed + further, **(how | changed))
+def _shown_by(found: Reconstruction, truth: Volume) -> dict[str, Any]:
+    """What a rehearsal shows of its `truth`."""
+    assert found.verdict is not None
+    counts = occupancy_counts(_told(found, found.object.voxelise(truth.grid)), _told(found, truth))
+    residual = residual_by_band(found.verdict).tolist()
+    return errors_of(found, truth) | counts | {RESIDUAL: residual, "cause": found.verdict.cause}
 
 
-def _frames(done: Reconstruction, coarse: Scan) -> tuple[np.ndarray, NoiseModel, np.ndarray]:
-    """Training frames [V, H, W] of a result without light and noise; noise and light of the measured ones."""
-    train = coarse.train()
-    lit = light_of(train, done.light, done.still)
-    noise = NoiseModel.of_frames(train.measured) if lit is None else lit.noise
-    factor = np.ones((1, 1, 1)) if lit is None else lit.factor().numpy()
+def _told(done: Reconstruction, volume: Volume) -> Volume:
+    """A volume with β in place of δ if a run does not tell δ."""
+    return volume if done.delta_told else of_absorption(volume)
+
+
+def _turned(exposures: Exposures, degrees: float) -> Exposures:
+    """Views turned by `degrees` about the object: about the line along y through what all look at."""
+    views, by = exposures.views, rotation_y([degrees])[0]
+    middle = Grid.of_views(views).centre
+    rotations = views.rotations @ by
+    shifts = views.shifts + ((rotations - views.rotations) @ middle)[:, :2]
+    return replace(exposures, views=replace(views, rotations=rotations, shifts=shifts))
+
+
+def _quiet(done: Reconstruction, exposures: Exposures) -> np.ndarray:
+    """Frames [V, H, W] of a result without light and noise."""
     with torch.no_grad():
-        frames = np.stack(list(simulated_frames(done.object, train.exposures, Simulation())))
-    return frames, noise, factor
+        return np.stack(list(simulated_frames(done.object, exposures, Simulation())))
+
+
+def _noise_and_light(done: Reconstruction, train: Scan) -> tuple[NoiseModel, np.ndarray]:
+    """Noise and light of the measured training frames at these pixels."""
+    lit = light_of(train, done.light, done.still)
+    if lit is None:
+        return NoiseModel.of_frames(train.measured), np.ones((1, 1, 1))
+    return lit.noise, lit.factor().numpy()
 
 
 def read_rehearsal(folder: RunFolder) -> Rehearsal | None:
@@ -394,7 +387,16 @@ def read_rehearsal(folder: RunFolder) -> Rehearsal | None:
         return None
     with as_written(folder.summary, "what rehearse wrote"):
         table = folder.read_summary().get(ENTRY)
-        return None if table is None else Rehearsal.from_dict(table)
+        if table is None:
+            return None
+        kept = folder.path / FOUND
+        return Rehearsal.from_dict(table, read_volume(kept) if kept.is_file() else None)
+
+
+def matter_of(folder: RunFolder) -> MatterMap | None:
+    """Where rehearsals of a run say that matter is likely; None where none are kept."""
+    kept = read_rehearsal(folder)
+    return None if kept is None or kept.found is None or not kept.runs else kept.matter
 
 
 def _keep(folder: RunFolder | None, kept: Rehearsal) -> None:

@@ -10,21 +10,25 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import h5py
 import numpy as np
 
-from ..checks import as_written, require, require_regular
+from ..checks import InputError, as_written, require, require_regular
 from ..display import card, of_object
 from ..io.atomic import atomic_path, require_new, require_parent, write_state
 from ..io.formats import read_marks
+from ..io.hdf5 import open_hdf5
 from ..io.json import read_json, write_json
 from ..io.lock import sole_writer
 from ..io.provenance import sha256
 from ..ranges import require_plausible
-from .provenance import CONFIG_SUM, RUN, config_sum, require_bound, write_manifest
+from .provenance import CONFIG_SUM, MANIFEST, RUN, config_sum, faults, require_bound, write_manifest
 
 if TYPE_CHECKING:
     from ..representations import Stored
 
+ROWS = 64
+"""Rows of a dataset that are read at a time."""
 OBJECT_SUM = "object_sha256"
 """The entry of summary.json that says what the object's file was."""
 
@@ -281,3 +285,41 @@ def _in_main_memory(state: Any) -> Any:
     if isinstance(state, dict):
         return {name: _in_main_memory(value) for name, value in state.items()}
     return type(state)(map(_in_main_memory, state)) if isinstance(state, (list, tuple)) else state
+
+
+def check(path: Path) -> tuple[int, list[str]]:
+    """How many files there are at `path`, an HDF5 file or a folder, and what is wrong, a sentence each.
+
+    A run folder is compared with its manifest; values of HDF5 files are read, which verifies their checksums where they
+    have any. Errors: `InputError` where there is nothing that could be checked.
+    """
+    require(path.exists(), f"{path} must be a file or a folder, but there is nothing; check the path.")
+    if path.is_file():
+        return 1, _faults_of_values(path)
+    run = RunFolder(path)
+    files = [file for file in sorted(path.rglob("*")) if file.is_file() and h5py.is_hdf5(file)]
+    wrong = faults(path, run.name()) if run.config.is_file() or (path / MANIFEST).is_file() else []
+    require(bool(files) or run.config.is_file(), f"{path} must hold a run or HDF5 files, but it holds none.")
+    return len(files), wrong + [fault for file in files for fault in _faults_of_values(file)]
+
+
+def _faults_of_values(path: Path) -> list[str]:
+    """What is wrong with an HDF5 file, if anything is."""
+    try:
+        with open_hdf5(path) as file:
+            file.visititems(_read)
+    except InputError as error:
+        return [str(error)]
+    return []
+
+
+def _read(name: str, item: h5py.Group | h5py.Dataset) -> None:
+    """Read all values of a dataset, a part at a time."""
+    if not isinstance(item, h5py.Dataset) or item.shape is None:
+        return
+    if item.ndim == 0:
+        item[()]
+        return
+    step = item.chunks[0] if item.chunks else ROWS
+    for start in range(0, item.shape[0], step):
+        item[start : start + step]

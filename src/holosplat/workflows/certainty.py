@@ -1,0 +1,201 @@
+"""Errors of a reconstruction's numbers, factors of their intervals, the probability that a voxel is matter, and
+reconstructions like one that was made."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..checks import require, shaped
+from ..geometry import Grid
+from ..matter import MaterialPrior
+from ..methods import Method
+from ..methods.illumination import CORRELATED, STAGE
+from ..metrics import robust_material_delta, volume_scores
+from ..metrics.volumes import require_same_grid
+from ..optics.background import LightOptions
+from ..scan import Scan
+from ..tables import read_table
+from ..volume import Volume
+from .evaluate import of_absorption
+from .reconstruct import reconstruct
+from .reconstruction import Reconstruction
+
+FACTORS = Path(__file__).with_name("conformal.toml")
+"""Factors of stated errors, with the scenes that they are of: benchmarks/calibrate_intervals.py."""
+LEVEL = 0.9
+"""Part of the calibration's scenes whose truth lies in an interval."""
+
+
+@dataclass(frozen=True)
+class Factor:
+    """How a quantity of rehearsals becomes an interval that holds the truth in `LEVEL` of the calibration's scenes.
+
+    floor: median of the quantity's scale over the scenes, added to that of a run: a scale near 0 promises too much
+    (Papadopoulos et al. 2008, normalised nonconformity); factor: of the sum of both
+    """
+
+    floor: float
+    factor: float
+    scenes: int
+
+
+@cache
+def factors() -> Mapping[str, Factor]:
+    """The table of the calibration, by quantity."""
+    return {name: Factor(**entry) for name, entry in read_table(FACTORS).items()}
+
+
+def conformal_quantile(scores: np.ndarray, level: float) -> float:
+    """The ⌈(n + 1) level⌉-th smallest of n scores, which the next one exceeds with a probability of at most 1 - level
+    (Vovk et al. 2005; Lei et al. 2018, section 2.2); infinite for too few."""
+    rank = math.ceil((len(scores) + 1) * level)
+    return float(np.sort(scores)[rank - 1]) if rank <= len(scores) else math.inf
+
+
+SIGNED, SIZES = ("total", "delta", "volume"), ("centre", "dice", "error")
+"""Quantities with errors of either sign, as shares; and sizes of errors: of the centre of mass [pixels], 1 - Dice, and
+the relative error of δ. Beside them stands `resolution`, the logarithm of a length over two pixels."""
+
+
+def centre_and_scale(name: str, values: np.ndarray) -> tuple[float, float]:
+    """Where a quantity's error is expected by its values in rehearsals [K], and how far off that may be.
+
+    Resolutions at the limit of the sampling have no spread, so that all runs have the same scale.
+    """
+    if name == "resolution":
+        return float(values.mean()), 1.0
+    return 0.0, float(np.sqrt(np.square(values).mean()))
+
+
+def errors_of(found: Reconstruction, truth: Volume) -> dict[str, float]:
+    """The quantities `SIGNED`, `SIZES` and `resolution` of a reconstruction against the true volume on its grid."""
+    volume = found.object.voxelise(truth.grid)
+    volume, truth = (volume, truth) if found.delta_told else (of_absorption(volume), of_absorption(truth))
+    scores, cell = volume_scores(volume, truth), math.prod(truth.grid.voxel_size)
+    stated = None if found.total is None else found.total.value
+    true = float(truth.delta.sum(dtype=np.float64)) * cell
+    size = float(np.abs(truth.delta).sum(dtype=np.float64)) * cell
+    stated = float(volume.delta.sum(dtype=np.float64)) * cell if stated is None else math.copysign(stated, true)
+    widest, resolution = max(truth.grid.shape) / 2, scores.resolution_half_bit
+    periods = 1.0 if resolution is None else min(resolution / (2 * scores.pitch), widest)
+    matter, true_matter = (each.delta / scores.material_delta > 0.5 for each in (volume, truth))
+    return {
+        "total": (stated - true) / size,
+        "delta": scores.delta_deviation,
+        "volume": float(matter.sum()) / float(true_matter.sum()) - 1,
+        "centre": float(np.linalg.norm(_centre(volume.delta) - _centre(truth.delta))),
+        "dice": 1 - scores.dice,
+        "error": scores.relative_error_delta,
+        "resolution": math.log(periods),
+    }
+
+
+def _centre(delta: np.ndarray) -> np.ndarray:
+    """The centre of mass [voxels]; the middle of an empty volume."""
+    weight = np.abs(delta).astype(np.float64)
+    weight = weight if weight.any() else np.ones_like(weight)
+    axes = [weight.sum(axis=tuple(b for b in range(3) if b != a)) for a in range(3)]
+    return np.array([float(np.average(np.arange(len(w)), weights=w)) for w in axes])
+
+
+@dataclass(frozen=True)
+class Again:
+    """Reconstructs other frames as a run did, with what it decided on matter and light."""
+
+    prior: MaterialPrior
+    method: Method
+    seed: int
+    done: Reconstruction
+
+    def __call__(self, scan: Scan, further: int = 0, **changed: Any) -> Reconstruction:
+        """The reconstruction of the training frames of `scan`, with another seed and what is `changed` of it."""
+        done = self.done
+        taken = next((each.choice for each in reversed(done.choice.decisions) if each.name == STAGE), "")
+        light = replace(done.light, noise="correlated" if CORRELATED in taken else "white")
+        light = light if done.still is None else LightOptions()  # which finds the fixed pattern, too
+        how = {"prior": self.prior, "method": self.method, "light": light, "matter": done.choice.matter}
+        return reconstruct(scan, seed=self.seed + further, **(how | changed))
+
+
+BINS = np.linspace(-0.5, 1.5, 41)
+"""Ends of the bins in which occupancies are counted; those beyond count in the outermost bins."""
+VOXELS, MATTER = "voxels", "matter"
+
+
+def _bins_of(occupancies: np.ndarray) -> np.ndarray:
+    return np.clip(np.digitize(occupancies, BINS) - 1, 0, len(BINS) - 2)
+
+
+def occupancy_counts(found: Volume, truth: Volume) -> dict[str, list[float]]:
+    """How many voxels of a reconstruction have an occupancy in each of the `BINS` [N], and of how many the truth, on
+    the same grid, is matter [N]. Occupancy and matter are those of `metrics.volumes`, with the δ of the true material.
+
+    Errors: `InputError` for other grids, and for a truth without matter.
+    """
+    require_same_grid(found.grid, truth.grid)
+    unit = robust_material_delta(truth)
+    which, matter = _bins_of(found.delta / unit), truth.delta / unit > 0.5
+    counts = (np.bincount(each.ravel(), minlength=len(BINS) - 1) for each in (which, which[matter]))
+    return {name: each.astype(float).tolist() for name, each in zip((VOXELS, MATTER), counts)}
+
+
+def matter_probabilities(voxels: np.ndarray, matter: np.ndarray) -> np.ndarray:
+    """Probabilities [N] that voxels of occupancies in N ascending bins are matter, where `matter` [N] of `voxels` [N]
+    were.
+
+    They are the shares (m + ½)/(n + 1), of Jeffreys' prior, and made to rise with occupancy by joining adjacent bins,
+    which is their weighted least-squares fit (Ayer et al. 1955; as calibration: Zadrozny & Elkan 2002, KDD). Errors:
+    `InputError` for counts that differ in length, and for more matter than voxels.
+    """
+    shaped("counts of matter", matter, np.shape(voxels))
+    require(bool((matter <= voxels).all()), "voxels of matter must be among those counted, but there are more of them.")
+    joined = list[tuple[float, float, int]]()
+    for one in zip(matter + 0.5, voxels + 1.0, [1] * len(voxels)):
+        while joined and joined[-1][0] * one[1] >= one[0] * joined[-1][1]:
+            before = joined.pop()
+            one = (before[0] + one[0], before[1] + one[1], before[2] + one[2])
+        joined.append(one)
+    return np.repeat([true / every for true, every, _ in joined], [many for *_, many in joined])
+
+
+@dataclass(frozen=True)
+class MatterMap:
+    """The probability that a voxel is matter, given its occupancy.
+
+    found: the reconstruction whose voxels are judged; unit: the δ of its material; table: [N] probabilities by `BINS`
+    """
+
+    found: Volume
+    unit: float
+    table: np.ndarray
+
+    @property
+    def values(self) -> np.ndarray:
+        """Probabilities [Z, Y, X] float32."""
+        return self.table[_bins_of(self.found.delta / self.unit)].astype(np.float32)
+
+    def on(self, grid: Grid) -> np.ndarray:
+        """Probabilities on another grid, [Z, Y, X] float32, linear between voxels; beyond the map those of its edge."""
+        from scipy.ndimage import map_coordinates  # which takes long to load
+
+        own = self.found.grid
+        places = [
+            (axis - start) / edge
+            for axis, start, edge in zip(grid.axes()[::-1], own.origin[::-1], own.voxel_size[::-1])
+        ]
+        return map_coordinates(self.values, np.meshgrid(*places, indexing="ij"), order=1, mode="nearest")
+
+    @property
+    def expected_dice(self) -> float:
+        """Dice expected of the voxels beyond half of the material's δ: 2 Σ_M p / (|M| + Σ p), the ratio of expected
+        overlap and sizes; nan without matter and chance of it."""
+        values, matter = self.values.astype(np.float64), self.found.delta / self.unit > 0.5
+        sizes = float(matter.sum() + values.sum())
+        return 2 * float(values[matter].sum()) / sizes if sizes else math.nan
