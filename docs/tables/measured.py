@@ -118,6 +118,16 @@ def triangles() -> str:
     return markdown((*head, "error of δ", "on the way"), lines)
 
 
+@table("thick-cell", "python benchmarks/thick_cell.py DATA", "15 minutes", "thick_cell.csv")
+def thick_cell() -> str:
+    """Straight rays and multislice on the fields of a measured cell."""
+    lines = list[list[str]]()
+    for row in read("thick_cell.csv"):
+        errors = (f"{100 * float(row[name]):.2f} %" for name in ("field", "phase", "fitted"))
+        lines.append([row["model"], row["sense"], f"{1e6 * float(row['focus']):.1f}", *errors])
+    return markdown(("waves", "sense", "focus / µm", "unseen fields", "unseen phases", "fitted fields"), lines)
+
+
 @table("cell", "python benchmarks/measured_cell.py --data FOLDER", "a quarter of an hour", "measured_cell.csv")
 def cell() -> str:
     """The living cell by default."""
