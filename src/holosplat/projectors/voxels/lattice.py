@@ -107,14 +107,12 @@ class LatticeProjector(_Plain):
         _require(name, array, wanted, self._device)
 
 
-RAYS_TOGETHER = 1 << 20
-"""Rays that are made at once, at most, in views: 20 bytes each, and ten times that while they are made."""
 RAYS_KEPT = 1 << 22
-"""Rays of projectors, at most, that are kept between calls; those of larger ones are made anew, which is quick."""
-STACKED = ((2, 1, 0), (1, 0, 2), (0, 1, 2))
+"""Rays of projectors, at most, that are kept between calls, 20 bytes each; more are made anew, view by view."""
+STACKED = ((2, 0, 1), (1, 0, 2), (0, 2, 1))
 """For slices across x, y and z: the axes of [Z, Y, X] that are their number, rows and columns."""
-Piece = tuple[slice, int, Tensor, Tensor]
-"""Views, the axis across the slices, the numbers of their pixels whose rays go along it, and these rays [5, N]."""
+Piece = tuple[int, int, Tensor | None, Tensor]
+"""A view, the axis that its rays go along, which of its pixels these are (None: all), and these rays [5, N]."""
 
 
 class RayProjector(_Plain):
@@ -143,15 +141,18 @@ class RayProjector(_Plain):
     def lines(self, array: Tensor) -> Tensor:
         """As `project`, differentiable: in `array`, and in the poses that ask for gradients."""
         self._require("volume", array, self.grid.shape)
-        stacks = {axis: pad(array.permute(order), (1, 1, 1, 1)).contiguous() for axis, order in enumerate(STACKED)}
-        found, at = list[Tensor](), slice(0, 0)
-        for views, axis, pixels, rays in self._pieces():
-            if views != at:
-                at = views
-                found.append(array.new_zeros((views.stop - views.start) * math.prod(self.views.shape)))
+        stacks = dict[int, Tensor]()
+        h, w = self.views.shape
+        images: list[Tensor | None] = [None] * len(self.views)
+        for v, axis, pixels, rays in self._pieces():
+            if axis not in stacks:
+                stacks[axis] = pad(array.permute(STACKED[axis]), (1, 1, 1, 1)).contiguous()
             seen = self._stack(rays).project(stacks[axis]) if self._plain else self._seen(stacks[axis], rays)
-            found[-1] = found[-1].index_copy(0, pixels, seen)
-        return torch.cat(found).reshape(len(self.views), *self.views.shape)
+            if pixels is not None:
+                before = images[v]
+                seen = (seen.new_zeros(w * h) if before is None else before).index_copy(0, pixels, seen)
+            images[v] = seen
+        return torch.stack([image for image in images if image is not None]).reshape(-1, w, h).transpose(1, 2)
 
     def project(self, array: Tensor) -> Tensor:
         """Line integrals [V, H, W] in metres × value of `array` [Z, Y, X]."""
@@ -161,16 +162,16 @@ class RayProjector(_Plain):
     def backproject(self, lines: Tensor) -> Tensor:
         """The adjoint of `project`: [V, H, W] → [Z, Y, X]."""
         self._require("line integrals", lines, (len(self.views), *self.views.shape))
-        lines = lines.detach() if self._plain else lines.detach().float()
+        lines = (lines.detach() if self._plain else lines.detach().float()).transpose(1, 2).flatten(1)
         stacks = dict[int, Tensor]()
         with torch.no_grad():
-            for views, axis, pixels, rays in self._pieces():
+            for v, axis, pixels, rays in self._pieces():
                 if axis not in stacks:
                     depth, height, width = (self.grid.shape[k] for k in STACKED[axis])
                     stacks[axis] = lines.new_zeros(depth, height + 2, width + 2)
-                self._stack(rays).backproject(lines[views].reshape(-1)[pixels], stacks[axis])
+                self._stack(rays).backproject(lines[v] if pixels is None else lines[v, pixels], stacks[axis])
             volume = lines.new_zeros(self.grid.shape)
-            for axis, stack in stacks.items():  # the order of axes is its own inverse but for y, whose is (1, 0, 2)
+            for axis, stack in stacks.items():
                 volume += stack[:, 1:-1, 1:-1].permute([STACKED[axis].index(k) for k in range(3)])
         return volume
 
@@ -190,46 +191,54 @@ class RayProjector(_Plain):
         return iter(self._kept) if self._kept is not None else self._made()
 
     def _made(self) -> Iterator[Piece]:
-        step = max(1, RAYS_TOGETHER // math.prod(self.views.shape))
-        for first in range(0, len(self.views), step):
-            views = slice(first, min(first + step, len(self.views)))
-            places, directions = _rays(self.grid, self._poses, views)
-            along = directions.detach().abs().argmax(1).reshape(-1)
-            for axis in range(3):
-                pixels = (along == axis).nonzero()[:, 0]
-                if len(pixels):
-                    at, by = (a.transpose(0, 1).reshape(4, -1)[:, pixels] for a in (places, directions))
-                    rays = _through(at, by, axis, self.grid)
-                    yield views, axis, pixels, rays if self._plain else rays.float()
+        for v in range(len(self.views)):
+            at, by, length = _rays(self.grid, self._poses, v)
+            for axis, pixels in _axes_of(by.detach(), self.views.shape):
+                chosen = (at, by, length) if pixels is None else (a[..., pixels] for a in (at, by, length))
+                rays = _through(*chosen, axis, self.grid)
+                yield v, axis, pixels, rays if self._plain else rays.float()
 
 
-def _rays(grid: Grid, poses: Poses, views: slice) -> tuple[Tensor, Tensor]:
-    """Where the pixels' centres lie, and where their rays go, each [V, 4, H·W] float64: x, y, z in voxels, and the
-    length [m] of the direction."""
+def _axes_of(by: Tensor, raster: tuple[int, int]) -> Iterator[tuple[int, Tensor | None]]:
+    """The axes that rays [3, W·H] go along most steeply, each with the numbers of its rays; None for all."""
+    h, w = raster
+    ends = torch.tensor([0, h - 1, (w - 1) * h, w * h - 1], device=by.device)
+    corners = by[:, ends]
+    steepest = corners.abs().argmax(0).tolist()
+    if steepest == steepest[:1] * 4 and abs(int(corners[steepest[0]].sign().sum())) == 4:
+        yield steepest[0], None  # directions that are steepest along an axis are a convex set
+        return
+    along = by.abs().argmax(0)
+    for axis in range(3):
+        pixels = (along == axis).nonzero()[:, 0]
+        if len(pixels):
+            yield axis, pixels
+
+
+def _rays(grid: Grid, poses: Poses, v: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Of a view's pixels, in columns: where their centres lie and where their rays go, each [3, W·H] float64, x, y, z in
+    voxels, and the length [W·H] [m] of the latter."""
     (h, w), there = poses.shape, poses.rotations.device
-    rotations, shifts = poses.rotations[views], poses.shifts[views]
-    pixel = poses.pitch * (torch.ones_like(shifts[:, 0]) if poses.scales is None else poses.scales[views])[:, None]
+    pixel = poses.pitch if poses.scales is None else poses.pitch * poses.scales[v]
     x, y = (torch.arange(n, dtype=torch.float64, device=there) - 0.5 * (n - 1) for n in (w, h))
-    x, y = (pixel * x + shifts[:, :1]).repeat(1, h), (pixel * y + shifts[:, 1:]).repeat_interleave(w, 1)
-    bent = torch.zeros_like(pixel) if poses.sources is None else 1 / poses.sources[views][:, None]
+    x, y = (pixel * x + poses.shifts[v, 0])[:, None], pixel * y + poses.shifts[v, 1]
     origin, size = (torch.tensor(a, dtype=torch.float64, device=there)[:, None] for a in (grid.origin, grid.voxel_size))
-    place = torch.stack((x, y, torch.zeros_like(x)), 1)
-    direction = torch.stack((x * bent, y * bent, torch.ones_like(x)), 1)
-    turned = rotations.transpose(1, 2)
-    length = direction.square().sum(1, keepdim=True).sqrt()
-    return (
-        torch.cat(((turned @ place - origin) / size, length), 1),
-        torch.cat((turned @ direction / size, torch.zeros_like(length)), 1),
-    )
+    along_x, along_y, along_z = (poses.rotations[v].T / size).unbind(1)
+    plane = (along_x[:, None, None] * x + along_y[:, None, None] * y).reshape(3, -1)
+    by, length = along_z[:, None].expand_as(plane), torch.ones_like(plane[0])
+    if poses.sources is not None:
+        by = by + plane / poses.sources[v]
+        length = (1 + (x.square() + y.square()) / poses.sources[v].square()).sqrt().reshape(-1)
+    return plane - origin / size, by, length
 
 
-def _through(at: Tensor, by: Tensor, axis: int, grid: Grid) -> Tensor:
-    """Rays [5, N] of a stack of slices across `axis`, of `_rays`' numbers [4, N]."""
+def _through(at: Tensor, by: Tensor, length: Tensor, axis: int, grid: Grid) -> Tensor:
+    """Rays [5, N] of a stack of slices across `axis`, of `_rays`' numbers."""
     slices, rows, columns = (2 - k for k in STACKED[axis])  # from axes of [Z, Y, X] to x, y, z
     row_step, step = by[rows] / by[slices], by[columns] / by[slices]
     middle = 0.5 * (grid.shape[2 - slices] - 1) - at[slices]
     row, column = at[rows] + middle * row_step + 1, at[columns] + middle * step + 1  # the rim is one voxel wide
-    return torch.stack((row, row_step, column, step, at[3] / by[slices].abs()))
+    return torch.stack((row, row_step, column, step, length / by[slices].abs()))
 
 
 class _Rays(torch.autograd.Function):
