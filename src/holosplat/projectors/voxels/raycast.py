@@ -44,7 +44,7 @@ def _cast(values: Tensor, grid: Grid, views: Views, v: int, step: float) -> Tens
     grown = 1 + bent * z[:, None, None]
     base = torch.as_tensor(grown * x[None, :, None] * to_unit[0] + z[:, None, None] * to_unit[2] - centre / half)
     rows = torch.as_tensor(grown[..., None] * (y[:, None] * to_unit[1])[None, :, None])
-    oblique = torch.as_tensor(np.sqrt(1 + bent**2 * (x**2 + y[:, None] ** 2))).to(values.dtype)
+    oblique = torch.as_tensor(np.sqrt(1 + bent**2 * (x**2 + y[:, None] ** 2))).to(values)
     chunk = max(1, 4_000_000 // (count * w))
     parts = []
     for start in range(0, h, chunk):
