@@ -77,14 +77,12 @@ class Views:
         object.__setattr__(self, "shape", (int(self.shape[0]), int(self.shape[1])))
         object.__setattr__(self, "pitch", positive("pixel size", self.pitch, "metres"))
         scales = np.ones(len(rotations)) if self.scales is None else np.asarray(self.scales, dtype=np.float64)
-        shaped("pixel scale", finite("pixel scale", scales), (len(rotations),))
-        require(bool((scales > 0).all()), "pixel scales must be above zero, but one is not; correct it.")
-        object.__setattr__(self, "scales", scales)
-        if self.sources is not None:
-            sources = finite("source distance", np.asarray(self.sources, dtype=np.float64))
-            shaped("source distance", sources, (len(rotations),))
-            require(bool((sources > 0).all()), "source distances must be above zero, but one is not; correct it.")
-            object.__setattr__(self, "sources", sources)
+        sources = None if self.sources is None else np.asarray(self.sources, dtype=np.float64)
+        for name, given, array in (("scales", "pixel scale", scales), ("sources", "source distance", sources)):
+            if array is not None:
+                shaped(given, finite(given, array), (len(rotations),))
+                require(bool((array > 0).all()), f"{given}s must be above zero, but one is not; correct it.")
+            object.__setattr__(self, name, array)
 
     @classmethod
     def of_pixels(
@@ -122,8 +120,8 @@ class Views:
 
     def fingerprint(self) -> bytes:
         """Equal for equal views, different for different ones."""
-        where = self.rotations.tobytes() + self.shifts.tobytes() + self.relative.tobytes()
-        where += b"" if self.sources is None else self.sources.tobytes()
+        arrays = (self.rotations, self.shifts, self.relative, *([] if self.sources is None else [self.sources]))
+        where = b"".join(array.tobytes() for array in arrays)
         return where + repr((self.shape, self.pitch)).encode()
 
     def __getitem__(self, index: np.ndarray | list[int] | slice) -> Views:
@@ -135,7 +133,7 @@ class Views:
         """The views themselves; `InputError` where beams diverge, which `what` does not model."""
         if self.sources is not None:
             raise InputError(
-                f"{what} needs parallel beams, but these diverge from sources {float(self.sources.min(initial=np.inf)):g} m "
+                f"{what} needs parallel beams, but these diverge from a source {self.sources.min(initial=np.inf):g} m "
                 "before the object; take a method that models cones of rays (docs/howto/which_instrument.md)."
             )
         return self

@@ -146,10 +146,8 @@ def test_gradients_of_poses_are_those_of_differences():
     for name in ("shifts", "scales", "sources"):
         given, step = getattr(views, name), 1e-6
         turned = randoms(*given.shape, seed=4).numpy()
-        ends = [
-            (RayProjector(grid, replace(views, **{name: given + s * turned}), "reference").project(volume) * image).sum()
-            for s in (step, -step)
-        ]
+        moved = [replace(views, **{name: given + s * turned}) for s in (step, -step)]
+        ends = [(RayProjector(grid, one, "reference").project(volume) * image).sum() for one in moved]
         wanted = float(ends[0] - ends[1]) / (2 * step)
         found = float((getattr(poses, name).grad.numpy() * turned).sum())
         assert found == pytest.approx(wanted, rel=1e-3), name

@@ -226,6 +226,7 @@ def sinograms_of(scan: Scan, options: AxisOptions, ratio: float | None, light: L
 
 def _sinograms(scan: Scan, options: AxisOptions, ratio: float | None, light: LightOptions) -> Sinograms:
     """Sinograms of all frames of `scan`."""
+    scan.views.parallel("finding the rotation axis")
     views = scan.views
     (h, w), p = views.shape, views.pixel_size
     images = shadows(scan, ratio, light).numpy()

@@ -57,6 +57,7 @@ def filtered_backprojection(
         "take sirt, art or tv.",
     )
     pitch, top = views.pixel_size, checked_upper(upper)
+    views.parallel("filtered back-projection")
     if missing is not None:
         lines = torch.where(missing, _explained(lines, views, grid, missing), lines)
     views, grid = in_pixels(lines, views, grid)

@@ -25,10 +25,11 @@ def mesh_line_integrals(
     """Line integrals [V, C, H, W] in metres × value, float64, of closed meshes with piecewise constant values.
 
     vertices: [P, 3] object frame [m]; faces: [F, 3] outward-oriented; face_values: [C, F], the value (δ, β, 1 …)
-    inside the closed surface that each face belongs to. A pixel is the mean over `rays × rays` rays through it. Overlapping bodies add up. Along a ray the depth inside a closed surface is
-    `Σ sign(n·z) z_hit` over the faces it crosses. In cones points go to `(x, y, z) / (1 + z / R)`, which keeps planes
-    planes and makes rays parallel, and depths come back at the hits: exact, too. backend: resolved; numpy computes for all but `cuda`, for which torch
-    does, on the GPU.
+    inside the closed surface that each face belongs to. A pixel is the mean over `rays × rays` rays through it.
+    Overlapping bodies add up. Along a ray the depth inside a closed surface is `Σ sign(n·z) z_hit` over the faces it
+    crosses. In cones points go to `(x, y, z) / (1 + z / R)`, which keeps planes planes and makes rays parallel, and
+    depths come back at the hits. backend: resolved; numpy computes for all but `cuda`, for which torch does, on the
+    GPU.
     """
     _check(vertices, faces, face_values, rays)
     if backend == "cuda":

@@ -55,10 +55,11 @@ def surface_thickness(
     vertices: [P, 3] float64 `(x, y, z)`, object frame; faces: [F, 3] int64, counter-clockwise seen from outside (a
     cavity's from within it); rotations [V, 3, 3], shifts [V, 2] `(sx, sy)`, float64: as for `projectors.splat`; lines:
     rows integrated in a pixel; pixels: [V] edges of the views' pixels in the unit of length, which is the pixel where
-    there are none; sources: [V] distances of the views' sources, none for parallel beams; backend: `cpu`, `cuda` or `reference`; trusted: values are taken as they are, without waiting for a
-    GPU. Overlapping bodies add up. Gradients: of the vertices, the rotations (all nine numbers, as of any matrix), the
-    shifts, the edges and the sources; a gradient that is not required costs nothing. Errors: `InputError` for other shapes and
-    types, and, unless trusted, vertices that are not finite and faces that name others.
+    there are none; sources: [V] distances of the views' sources, none for parallel beams; backend: `cpu`, `cuda` or
+    `reference`; trusted: values are taken as they are, without waiting for a GPU. Overlapping bodies add up. Gradients:
+    of the vertices, the rotations (all nine numbers, as of any matrix), the shifts, the edges and the sources; a
+    gradient that is not required costs nothing. Errors: `InputError` for other shapes and types, and, unless trusted,
+    vertices that are not finite and faces that name others.
     """
     _check(vertices, faces, trusted)
     require(1 <= lines <= MOST_LINES, f"lines must be from 1 to {MOST_LINES}, but it is {lines}.")
@@ -72,11 +73,9 @@ def surface_thickness(
         f"{tuple(rotations.shape)}, {tuple(shifts.shape)}{edges}, on rasters {tuple(shape)}.",
     )
     if sources is not None:
-        seen = [
-            _in_cone(vertices, faces, (rotations[v], shifts[v], None if pixels is None else pixels[v]), sources[v], shape,
-                     lines, backend)
-            for v in range(views)
-        ]  # fmt: skip
+        edges = [None] * views if pixels is None else list(pixels)
+        poses = zip(rotations, shifts, edges, sources)
+        seen = [_in_cone(vertices, faces, pose, shape, lines, backend) for pose in poses]
         return torch.stack(seen) if seen else vertices.new_zeros(0, *shape)
     poses, faces = (rotations.to(vertices), shifts.to(vertices)), faces.contiguous()
     if pixels is None:
@@ -91,17 +90,14 @@ def surface_thickness(
 def _in_cone(
     vertices: Tensor,
     faces: Tensor,
-    pose: tuple[Tensor, Tensor, Tensor | None],
-    source: Tensor,
+    pose: tuple[Tensor, Tensor, Tensor | None, Tensor],
     shape: tuple[int, int],
     lines: int,
     backend: str,
 ) -> Tensor:
-    """One view [H, W]; pose: its rotation, its shift, and the edge of its pixels or None."""
-    rotation, shift, edge = (None if a is None else a.to(vertices) for a in pose)
-    assert rotation is not None
-    assert shift is not None
-    source, upright = source.to(vertices), torch.eye(3).to(vertices)[None]
+    """One view [H, W]; pose: its rotation, its shift, the edge of its pixels or None, and its source."""
+    rotation, shift, source = (a.to(vertices) for a in (pose[0], pose[1], pose[3]))
+    edge, upright = None if pose[2] is None else pose[2].to(vertices), torch.eye(3).to(vertices)[None]
     lab = vertices @ rotation.T
     seen = torch.cat((lab[:, :2] / (1 + lab[:, 2:] / source), lab[:, 2:]), 1)
     one = None if edge is None else edge[None]

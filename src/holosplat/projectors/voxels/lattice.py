@@ -1,5 +1,4 @@
-"""Projection for any pose, with exact adjoints and pose gradients: voxels that cast hats, and rays of parallel beams and
-cones through the voxels."""
+"""Projection for any pose, exact adjoints, gradients of poses: voxels that cast hats, and rays, those of cones, too."""
 
 from __future__ import annotations
 
@@ -216,8 +215,8 @@ def _axes_of(by: Tensor, raster: tuple[int, int]) -> Iterator[tuple[int, Tensor 
 
 
 def _rays(grid: Grid, poses: Poses, v: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Of a view's pixels, in columns: where their centres lie and where their rays go, each [3, W·H] float64, x, y, z in
-    voxels, and the length [W·H] [m] of the latter."""
+    """Of a view's pixels, in columns: where their centres lie and where their rays go, each [3, W·H] float64, x, y, z
+    in voxels, and the length [W·H] [m] of the latter."""
     (h, w), there = poses.shape, poses.rotations.device
     pixel = poses.pitch if poses.scales is None else poses.pitch * poses.scales[v]
     x, y = (torch.arange(n, dtype=torch.float64, device=there) - 0.5 * (n - 1) for n in (w, h))

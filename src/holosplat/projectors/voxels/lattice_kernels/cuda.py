@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from ....launch import launching
-from . import triton_lattice
-from . import Lattice
+from . import Lattice, triton_lattice
 
 
 class Kernels:
