@@ -10,6 +10,7 @@ caster. `seconds` is processor time on one thread, the least of three runs in tu
 from __future__ import annotations
 
 import argparse
+import importlib
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -39,20 +40,18 @@ def blobs(grid: Grid) -> np.ndarray:
         peak * np.exp(-((x - a * n) ** 2 + (y[:, None] - b * n) ** 2 + (z[:, None, None] - c * n) ** 2) / (s * n) ** 2)
         for a, b, c, s, peak in BLOBS
     ]
-    return sum(parts).astype(np.float32)
+    return np.sum(parts, axis=0).astype(np.float32)
 
 
 class Joseph:
     """itk-rtk's forward projector and its adjoint. It turns the other way round, and has columns the other way."""
 
     def __init__(self, grid: Grid, angles: np.ndarray, raster: tuple[int, int], distance: float) -> None:
-        import itk
-        from itk import RTK
-
+        itk: Any = importlib.import_module("itk")
         itk.MultiThreaderBase.SetGlobalDefaultNumberOfThreads(torch.get_num_threads())
-        self._itk, self._rtk, self._kind = itk, RTK, itk.Image[itk.F, 3]
+        self._itk, self._rtk, self._kind = itk, itk.RTK, itk.Image[itk.F, 3]
         self._shape, self._raster = grid.shape, (len(angles), *raster)
-        self._geometry = RTK.ThreeDCircularProjectionGeometry.New()
+        self._geometry = itk.RTK.ThreeDCircularProjectionGeometry.New()
         for angle in angles:  # a detector as far behind the axis as the source is before it, with pixels twice as large
             self._geometry.AddProjection(distance, 2 * distance, float(180 - angle))
 

@@ -193,8 +193,10 @@ class RayProjector(_Plain):
         for v in range(len(self.views)):
             at, by, length = _rays(self.grid, self._poses, v)
             for axis, pixels in _axes_of(by.detach(), self.views.shape):
-                chosen = (at, by, length) if pixels is None else (a[..., pixels] for a in (at, by, length))
-                rays = _through(*chosen, axis, self.grid)
+                if pixels is None:
+                    rays = _through(at, by, length, axis, self.grid)
+                else:
+                    rays = _through(at[:, pixels], by[:, pixels], length[pixels], axis, self.grid)
                 yield v, axis, pixels, rays if self._plain else rays.float()
 
 
