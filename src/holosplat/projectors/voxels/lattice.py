@@ -209,9 +209,10 @@ def _axes_of(by: Tensor, raster: tuple[int, int]) -> Iterator[tuple[int, Tensor 
     if steepest == steepest[:1] * 4 and abs(int(corners[steepest[0]].sign().sum())) == 4:
         yield steepest[0], None  # directions that are steepest along an axis are a convex set
         return
-    along = by.abs().argmax(0)
-    for axis in range(3):
-        pixels = (along == axis).nonzero()[:, 0]
+    x, y, z = by.abs()
+    along_z = z >= torch.maximum(x, y)
+    for axis, mask in enumerate((~along_z & (x >= y), ~along_z & (x < y), along_z)):
+        pixels = mask.nonzero()[:, 0]
         if len(pixels):
             yield axis, pixels
 
