@@ -26,8 +26,8 @@ from holosplat.geometry import Grid, Views
 from holosplat.projectors.voxels import RayProjector
 
 COLUMNS = (
-    "size", "rows", "views", "distance", "tangent", "error", "made_seconds", "seconds", "joseph_seconds", "times_faster",
-    "adjoint_seconds", "joseph_adjoint_seconds", "adjoint_times_faster", "machine", "commit",
+    "size", "rows", "views", "distance", "tangent", "error", "made_seconds", "seconds", "joseph_seconds",
+    "times_faster", "adjoint_seconds", "joseph_adjoint_seconds", "adjoint_times_faster", "machine", "commit",
 )  # fmt: skip
 BLOBS = ((-0.1, 0.05, 0.12, 0.12, 1.0), (0.15, -0.08, 0.06, 0.08, 0.5), (0.05, 0.12, -0.18, 0.06, 0.8))
 """Centre x, y, z and width, over the volume's size, and peak."""

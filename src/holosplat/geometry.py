@@ -31,8 +31,7 @@ class Views:
     shape: `(H, W)` pixels.
     pitch: `p` [m], the unit of lengths in pixels; the pixel size where all views have the same.
     scales: [V] pixel sizes of the views over `pitch` (None: all one). Pixels are square.
-    sources: [V] distances R [m] of point sources, at `(0, 0, -R)` of the lab frame (None: parallel beams). The raster
-        is that of the plane `z = 0`: the detector's pixels over the magnification.
+    sources: [V] distances R [m] of point sources, at `(0, 0, -R)` of the lab (None: parallel); pixels are at `z = 0`.
 
     In units of its own pixel, a view of pixels `s p` is one of pixels `p` with the matrix `R / s` and the shift `(sx,
     sy) / s`. Errors: `InputError` for matrices that are no rotations, and for shapes, shifts or sizes out of range.

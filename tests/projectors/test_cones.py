@@ -55,6 +55,12 @@ def asked(poses: Poses) -> list[Tensor]:
     return [a.grad for a in given if a is not None]
 
 
+def distances(views: Views) -> np.ndarray:
+    """The sources' distances, which are there."""
+    assert views.sources is not None
+    return views.sources
+
+
 def blob(grid: Grid) -> Tensor:
     """A Gaussian of peak one on the grid, float64."""
     x, y, z = (torch.from_numpy(a - c) for a, c in zip(grid.axes(), CENTRE))
@@ -69,7 +75,7 @@ def blob_lines(views: Views) -> np.ndarray:
         p, (sx, sy) = views.pixel_sizes[v], views.shifts[v]
         x, y = np.meshgrid((np.arange(w) + 0.5 - w / 2) * p + sx, (np.arange(h) + 0.5 - h / 2) * p + sy)
         pixels = np.stack([x, y, np.zeros_like(x)], -1)
-        source = np.array([0.0, 0.0, -views.sources[v]])
+        source = np.array([0.0, 0.0, -distances(views)[v]])
         along = (pixels - source) / np.linalg.norm(pixels - source, axis=-1, keepdims=True)
         to = views.rotations[v] @ CENTRE - source
         squared = (to**2).sum() - (along @ to) ** 2
@@ -164,10 +170,9 @@ def test_what_knows_no_cones_refuses_them():
 
 def test_views_keep_their_sources():
     views = cones(anyhow(4, (5, 6)))
-    assert views.sources is not None
-    assert views[[2, 0]].sources.tolist() == views.sources[[2, 0]].tolist()
-    assert views.in_units_of(0.5).sources.tolist() == (2 * views.sources).tolist()
-    assert Poses.of(views)[torch.tensor([1])].views().sources.tolist() == [views.sources[1]]
+    assert distances(views[[2, 0]]).tolist() == distances(views)[[2, 0]].tolist()
+    assert distances(views.in_units_of(0.5)).tolist() == (2 * distances(views)).tolist()
+    assert distances(Poses.of(views)[torch.tensor([1])].views()).tolist() == [distances(views)[1]]
     assert views.fingerprint() != replace(views, sources=None).fingerprint()
     with pytest.raises(InputError, match="source distances must be above zero, but one is not"):
         replace(views, sources=np.array([1.0, -1, 1, 1]))
@@ -191,9 +196,9 @@ def chords(views: Views) -> np.ndarray:
         p, (sx, sy) = views.pixel_sizes[v], views.shifts[v]
         columns, rows = ((np.arange(n)[:, None] + 0.5 - n / 2 + sub).ravel() * p for n in (w, h))
         x, y = np.meshgrid(columns + sx, rows + sy)
-        along = np.stack([x, y, np.full_like(x, views.sources[v])], -1)
+        along = np.stack([x, y, np.full_like(x, distances(views)[v])], -1)
         along /= np.linalg.norm(along, axis=-1, keepdims=True)
-        to = views.rotations[v] @ CENTRE + [0, 0, views.sources[v]]
+        to = views.rotations[v] @ CENTRE + [0, 0, distances(views)[v]]
         squared = (to**2).sum() - (along @ to) ** 2
         out[v] = 2 * np.sqrt(np.clip(25.0 - squared, 0, None)).reshape(h, 8, w, 8).mean((1, 3))
     return out
