@@ -46,7 +46,6 @@ class SmoothVolume(Method):
     """
 
     kind: ClassVar[str] = "volume"
-    cones: ClassVar[bool] = True
     likelier: ClassVar[bool] = True
     two_sided: ClassVar[bool] = True
 
