@@ -87,6 +87,12 @@ struct HoloSlices {  // a sparse matrix that all slices share: what each voxel o
   const float* weights;   // [entries]
 };
 
+struct HoloRays {  // rays through slices [depth, height, width] whose outermost rows and columns are zeros
+  int64_t depth, height, width, count;
+  const float* places;  // [5, count] in voxels: row in the middle of the stack, rows a slice, column, columns a slice;
+                        // and the length of the ray from slice to slice, in any unit
+};
+
 struct HoloOptions {
   double cutoff;    // half-width of a Gaussian's box in standard deviations
   double variance;  // added to the covariance: what a pixel or voxel does
@@ -134,6 +140,14 @@ HOLO_EXPORT int64_t holosplat_lattice_backproject(const HoloLattice*, const Holo
 HOLO_EXPORT int64_t holosplat_lattice_poses(const HoloLattice*, const HoloViews*, const float* volume,
                                             const float* image_gradient, double* rotations, double* shifts,
                                             int64_t threads);
+
+// Line integrals along rays, image [count] from volume [depth, height, width], and the exact adjoint, which adds to the
+// volume. gradients [5, count] <- derivatives by the
+// rays' `places` of the scalar whose derivative by the image is `image_gradient`.
+HOLO_EXPORT int64_t holosplat_rays_project(const HoloRays*, const float* volume, float* image, int64_t threads);
+HOLO_EXPORT int64_t holosplat_rays_backproject(const HoloRays*, const float* image, float* volume, int64_t threads);
+HOLO_EXPORT int64_t holosplat_rays_gradients(const HoloRays*, const float* volume, const float* image_gradient,
+                                             float* gradients, int64_t threads);
 
 // lines [rays, slices] from volume [voxels, slices], and the exact adjoint.
 HOLO_EXPORT int64_t holosplat_slices_project(const HoloSlices*, const float* volume, float* lines, int64_t threads);

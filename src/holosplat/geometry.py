@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .checks import InputError, finite, positive, require, shaped
+from .rotations import rotation_tilted as rotation_tilted
+from .rotations import rotation_y as rotation_y
 
 if TYPE_CHECKING:
     import torch
@@ -20,42 +22,16 @@ FARTHEST_PX = 1e6
 """Pixels beyond which no detector lies beside its place."""
 
 
-def rotation_y(angles_deg: np.ndarray | list[float]) -> np.ndarray:
-    """Rotation matrices [V, 3, 3] of tomographic angles [V] in degrees about y (docs/conventions.md)."""
-    angles = np.asarray(angles_deg, dtype=np.float64).reshape(-1)
-    for angle in angles[~np.isfinite(angles)]:
-        raise InputError(f"every angle must be a finite number of degrees, but one is {angle:g}; correct it.")
-    theta = np.deg2rad(angles)
-    c, s, o, i = np.cos(theta), np.sin(theta), np.zeros_like(theta), np.ones_like(theta)
-    return np.stack([np.stack([c, o, s], -1), np.stack([o, i, o], -1), np.stack([-s, o, c], -1)], -2)
-
-
-def rotation_tilted(angles_deg: np.ndarray | list[float], tilts_deg: np.ndarray | list[float]) -> np.ndarray:
-    """Rotation matrices [V, 3, 3] of angles [V] about y, tilted [V] out of the plane: `R = R_x(tilt) R_y(angle)`.
-
-    Both in degrees; the tilt is by how much the beam leaves the plane that is normal to the object's y axis, so that
-    the views have no common axis. Errors: `InputError` for values that are not finite, and unless they are as many.
-    """
-    tilts = finite("tilt", np.asarray(tilts_deg, dtype=np.float64).reshape(-1))
-    turned = rotation_y(angles_deg)
-    require(
-        len(tilts) == len(turned),
-        f"there must be one tilt for each of the {len(turned)} angles, but there are {len(tilts)}.",
-    )
-    c, s = np.cos(np.deg2rad(tilts)), np.sin(np.deg2rad(tilts))
-    o, i = np.zeros_like(c), np.ones_like(c)
-    return np.stack([np.stack([i, o, o], -1), np.stack([o, c, -s], -1), np.stack([o, s, c], -1)], -2) @ turned
-
-
 @dataclass(frozen=True)
 class Views:
-    """The poses of V parallel-beam views, and the raster of their detectors.
+    """The poses of V views, and the raster of their detectors.
 
     rotations: [V, 3, 3], `x_lab = R x_obj`.
     shifts: [V, 2] detector shifts `(sx, sy)` [m].
     shape: `(H, W)` pixels.
     pitch: `p` [m], the unit of lengths in pixels; the pixel size where all views have the same.
     scales: [V] pixel sizes of the views over `pitch` (None: all one). Pixels are square.
+    sources: [V] distances R [m] of point sources, at `(0, 0, -R)` of the lab (None: parallel); pixels are at `z = 0`.
 
     In units of its own pixel, a view of pixels `s p` is one of pixels `p` with the matrix `R / s` and the shift `(sx,
     sy) / s`. Errors: `InputError` for matrices that are no rotations, and for shapes, shifts or sizes out of range.
@@ -79,6 +55,7 @@ class Views:
     shape: tuple[int, int]
     pitch: float
     scales: np.ndarray | None = None
+    sources: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         rotations = finite("view rotation", np.asarray(self.rotations, dtype=np.float64))
@@ -99,9 +76,12 @@ class Views:
         object.__setattr__(self, "shape", (int(self.shape[0]), int(self.shape[1])))
         object.__setattr__(self, "pitch", positive("pixel size", self.pitch, "metres"))
         scales = np.ones(len(rotations)) if self.scales is None else np.asarray(self.scales, dtype=np.float64)
-        shaped("pixel scale", finite("pixel scale", scales), (len(rotations),))
-        require(bool((scales > 0).all()), "pixel scales must be above zero, but one is not; correct it.")
-        object.__setattr__(self, "scales", scales)
+        sources = None if self.sources is None else np.asarray(self.sources, dtype=np.float64)
+        for name, given, array in (("scales", "pixel scale", scales), ("sources", "source distance", sources)):
+            if array is not None:
+                shaped(given, finite(given, array), (len(rotations),))
+                require(bool((array > 0).all()), f"{given}s must be above zero, but one is not; correct it.")
+            object.__setattr__(self, name, array)
 
     @classmethod
     def of_pixels(
@@ -139,11 +119,23 @@ class Views:
 
     def fingerprint(self) -> bytes:
         """Equal for equal views, different for different ones."""
-        where = self.rotations.tobytes() + self.shifts.tobytes() + self.relative.tobytes()
+        arrays = (self.rotations, self.shifts, self.relative, *([] if self.sources is None else [self.sources]))
+        where = b"".join(array.tobytes() for array in arrays)
         return where + repr((self.shape, self.pitch)).encode()
 
     def __getitem__(self, index: np.ndarray | list[int] | slice) -> Views:
-        return replace(self, rotations=self.rotations[index], shifts=self.shifts[index], scales=self.relative[index])
+        sources = None if self.sources is None else self.sources[index]
+        rotations, shifts, scales = self.rotations[index], self.shifts[index], self.relative[index]
+        return replace(self, rotations=rotations, shifts=shifts, scales=scales, sources=sources)
+
+    def parallel(self, what: str) -> Views:
+        """The views themselves; `InputError` where beams diverge, which `what` does not model."""
+        if self.sources is not None:
+            raise InputError(
+                f"{what} needs parallel beams, but these diverge from a source {self.sources.min(initial=np.inf):g} m "
+                "before the object; take a method that models cones of rays (docs/howto/which_instrument.md)."
+            )
+        return self
 
     @property
     def relative(self) -> np.ndarray:
@@ -195,14 +187,15 @@ class Views:
 
     @property
     def shares_axis(self) -> bool:
-        """Whether every view turns about the object's y axis only, on pixels of one size: slices then decouple."""
+        """Whether every view turns about the object's y axis only, parallel, on pixels of one size: slices decouple."""
         y = np.array([0.0, 1.0, 0.0])
         upright = np.allclose(self.rotations[:, 1], y) and np.allclose(self.shifts[:, 1], self.shifts[:1, 1])
-        return bool(upright) and self.has_one_pixel
+        return bool(upright) and self.has_one_pixel and self.sources is None
 
     def in_units_of(self, length: float) -> Views:
         """The same views with `length` [m] as the unit of length."""
-        return replace(self, shifts=self.shifts / length, pitch=self.pitch / length)
+        sources = None if self.sources is None else self.sources / length
+        return replace(self, shifts=self.shifts / length, pitch=self.pitch / length, sources=sources)
 
     def refined(self, factor: int) -> Views:
         """The same field of view on a raster `factor` times finer."""
@@ -263,6 +256,7 @@ class Poses:
     shape: `(H, W)` pixels.
     pitch: of square pixels [m].
     scales: [V] float64, pixel sizes over `pitch`, as in `Views`; None where all are one.
+    sources: [V] float64, distances of sources [m], as in `Views`; None for parallel beams.
 
     Rotations, shifts and scales may require gradients, which projections then give them.
     """
@@ -272,6 +266,7 @@ class Poses:
     shape: tuple[int, int]
     pitch: float
     scales: torch.Tensor | None = None
+    sources: torch.Tensor | None = None
 
     @classmethod
     def of(cls, views: Views, device: torch.device | str = "cpu") -> Poses:
@@ -281,7 +276,8 @@ class Poses:
         arrays = (np.ascontiguousarray(a) for a in (views.rotations, views.shifts, views.relative))
         rotations, shifts, scales = (torch.from_numpy(a).to(device) for a in arrays)
         alike = bool((views.relative == 1).all())
-        return cls(rotations, shifts, views.shape, views.pitch, None if alike else scales)
+        sources = None if views.sources is None else torch.from_numpy(views.sources).to(device)
+        return cls(rotations, shifts, views.shape, views.pitch, None if alike else scales, sources)
 
     def __len__(self) -> int:
         return len(self.rotations)
@@ -310,14 +306,20 @@ class Poses:
     def views(self) -> Views:
         """The same poses as `Views`, without gradients."""
         rotations, shifts = (array.detach().cpu().numpy() for array in (self.rotations, self.shifts))
-        scales = None if self.scales is None else self.scales.detach().cpu().numpy()
-        return Views(rotations, shifts, self.shape, self.pitch, scales)
+        more = (None if a is None else a.detach().cpu().numpy() for a in (self.scales, self.sources))
+        return Views(rotations, shifts, self.shape, self.pitch, *more)
 
     def __getitem__(self, index: torch.Tensor) -> Poses:
         """The poses `index` [K], an integer tensor on the same device."""
-        scales = None if self.scales is None else self.scales.index_select(0, index)
+        scales, sources = (None if a is None else a.index_select(0, index) for a in (self.scales, self.sources))
         rotations, shifts = self.rotations.index_select(0, index), self.shifts.index_select(0, index)
-        return replace(self, rotations=rotations, shifts=shifts, scales=scales)
+        return replace(self, rotations=rotations, shifts=shifts, scales=scales, sources=sources)
+
+    def parallel(self, what: str) -> Poses:
+        """The poses themselves; `InputError` where beams diverge, which `what` does not model."""
+        if self.sources is not None:
+            self.views().parallel(what)
+        return self
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from .checks import MissingError
 
-ABI = 8
+ABI = 9
 ISAS = ("sse2", "avx2", "avx512")
 """Builds for x86-64, slowest first. Other processors have one build, `generic`."""
 
@@ -75,6 +75,12 @@ class Lattice(ctypes.Structure):
         ("origin", c_double * 3),
         ("pitch", c_double * 3),
     ]
+
+
+class Rays(ctypes.Structure):
+    """Rays through slices: counts of slices, rows, columns and rays, and a pointer to float32 [5, rays]."""
+
+    _fields_ = [(name, c_int64) for name in ("depth", "height", "width", "count")] + [("places", c_void_p)]
 
 
 class Raster(ctypes.Structure):
@@ -156,6 +162,9 @@ _FUNCTIONS = {
     "holosplat_lattice_project": (POINTER(Lattice), POINTER(Views), c_void_p, c_void_p, c_int64),
     "holosplat_lattice_backproject": (POINTER(Lattice), POINTER(Views), c_void_p, c_void_p, c_int64),
     "holosplat_lattice_poses": (POINTER(Lattice), POINTER(Views), *(c_void_p,) * 4, c_int64),
+    "holosplat_rays_project": (POINTER(Rays), *(c_void_p,) * 2, c_int64),
+    "holosplat_rays_backproject": (POINTER(Rays), *(c_void_p,) * 2, c_int64),
+    "holosplat_rays_gradients": (POINTER(Rays), *(c_void_p,) * 3, c_int64),
     "holosplat_slices_project": (POINTER(Slices), *(c_void_p,) * 2, c_int64),
     "holosplat_slices_backproject": (POINTER(Slices), *(c_void_p,) * 2, c_int64),
     "holosplat_surface": (POINTER(Surface), POINTER(Raster), c_int64, c_void_p, c_int64),

@@ -201,6 +201,7 @@ class Wall:
 
     def project(self, views: Views) -> tuple[torch.Tensor, torch.Tensor]:
         """Line integrals (B, D) [V, H, W] float64 [m], means over pixels along the rows of what its rays pass."""
+        views.parallel("a wall in the beam")
         import torch
 
         shape = (2, len(views), *views.shape)

@@ -130,6 +130,10 @@ def operations(every_size: bool) -> list[Callable[[], None]]:
         kernels.project(torch.ones(3, 4, 5))
         kernels.backproject(torch.ones(2, 8, 9))
         kernels.pose_gradients(torch.ones(3, 4, 5), torch.ones(2, 8, 9))
+        rays = hats.Stack(torch.ones(5, 7))
+        rays.project(torch.ones(3, 4, 5))
+        rays.backproject(torch.ones(7), torch.ones(3, 4, 5))
+        rays.gradients(torch.ones(3, 4, 5), torch.ones(7))
 
     def slice_matrix() -> None:
         entries = (torch.ones(4, dtype=torch.int64), torch.ones(5, dtype=torch.int64), torch.ones(5))

@@ -22,7 +22,7 @@ Files = dict[str, str]
 """Path below src/holosplat, or `holosplat_bench/…` → source text."""
 
 PLAN = """
-units version checks ranges lazy tables native launch backends memory progress display plugins
+units version checks ranges rotations lazy tables native launch backends memory progress display plugins
 geometry frames divided_light scan volume mesh matter
 ← materials optics metrics projectors preprocess inference
 ← specimens representations model

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -9,6 +10,8 @@ import numpy as np
 import pytest
 import tifffile
 
+import holosplat as hs
+from holosplat.align.axis import find_axis
 from holosplat.checks import InputError
 from holosplat.geometry import Views
 from holosplat.io.formats import read, read_as
@@ -16,6 +19,7 @@ from holosplat.io.nxtomo import write_scan
 from holosplat.io.reading import Reading, Told
 from holosplat.optics.coherence import effective_geometry
 from holosplat.scan import Exposures, Scan
+from holosplat.workflows.join import join
 
 SOURCE, BEHIND, PIXEL = 0.25, 0.75, 4e-6
 WANTED = effective_geometry(SOURCE, BEHIND, PIXEL)
@@ -71,7 +75,6 @@ def test_a_nikon_file_finds_its_images_in_another_folder(tmp_path: Path):
         ({"WhiteLevel": "0"}, "WhiteLevel must be above 0"),
         ({"Name": "other"}, "images whose names begin with 'other', but it holds none"),
         ({"InputFolderName": "gone"}, "InputFolderName must be a folder"),
-        ({"SrcToObject": "0.1", "SrcToDetector": "1"}, r"the source: a source 0\.0001 m before .* a cone of rays"),
     ],
 )
 def test_nikon_files_that_cannot_be_are_refused(change, said, tmp_path: Path):
@@ -107,8 +110,50 @@ def test_a_source_that_is_said_goes_before_that_of_a_file(said, tmp_path: Path):
         assert found.distance == pytest.approx([WANTED.distance] * 2, rel=1e-12)
 
 
-def test_a_source_that_is_too_near_is_refused(tmp_path: Path):
+# --- cones whose rays are not parallel at the object --------------------------------------------------------
+
+
+def test_a_source_nearby_makes_a_cone_of_rays(tmp_path: Path):
+    """Half of 14 pixels of 0.4 mm, 10 mm away, are a tangent of 0.28, and so are they at the object."""
     (tmp_path / "angles.txt").write_text("0\n1\n2\n")
-    told = Told(20.0, distance=0.02, pixel_size=2e-4, source_distance=0.01, angles=tmp_path / "angles.txt")
-    with pytest.raises(InputError, match=r"--source-distance: .* cone of rays"):
-        read_as(a_folder(tmp_path / "run"), Reading(told))
+    told = Told(20.0, distance=0.005, pixel_size=4e-4, source_distance=0.005, angles=tmp_path / "angles.txt")
+    found = read_as(a_folder(tmp_path / "run"), Reading(told)).exposures
+    assert found.views.sources is not None
+    assert found.views.sources.tolist() == [0.005] * 3
+    assert (found.views.pixel_size, found.distance[0]) == pytest.approx((2e-4, 0.0025), rel=1e-12)
+    wide = {"SrcToObject": "5", "SrcToDetector": "10", "DetectorPixelSizeX": "0.4", "DetectorPixelSizeY": "0.4"}
+    own = read(nikon(tmp_path / "run", wide), {"energy_kev": 20.0}).exposures.views
+    assert own.sources is not None
+    assert own.sources == pytest.approx([0.005] * 3)
+    assert read(nikon(tmp_path / "run"), {"energy_kev": 20.0}).exposures.views.sources is None
+
+
+def test_cones_of_rays_are_written_and_read_back(tmp_path: Path):
+    views = replace(Views.evenly_spaced(3, shape=SHAPE, pixel_size=PIXEL), sources=np.array([1e-3, 2e-3, 1e-3]))
+    scan = Scan(np.ones((3, *SHAPE)), Exposures.of(views, 20.0, 0.01), np.zeros(3))
+    write_scan(tmp_path / "cones.nxs", scan)
+    found = read(tmp_path / "cones.nxs").exposures
+    assert np.array_equal(found.views.sources, views.sources)
+    assert found.views.pixel_size == PIXEL
+    assert found.distance.tolist() == [0.01] * 3
+    parallel = replace(scan, exposures=Exposures.of(replace(views, sources=None), 20.0, 0.01))
+    write_scan(tmp_path / "parallel.nxs", parallel)
+    assert read(tmp_path / "parallel.nxs").exposures.views.sources is None
+    views = join([tmp_path / "cones.nxs"] * 2, tmp_path / "joined.nxs").views
+    assert np.array_equal(views.sources, [1e-3, 2e-3, 1e-3] * 2)
+    with pytest.raises(InputError, match="must all have cones of rays or none, but 1 of 2 have them"):
+        join([tmp_path / "cones.nxs", tmp_path / "parallel.nxs"], tmp_path / "both.nxs")
+
+
+def test_what_needs_parallel_beams_refuses_cones(tmp_path: Path):
+    views = replace(Views.evenly_spaced(3, shape=SHAPE, pixel_size=PIXEL), sources=np.full(3, 1e-3))
+    scan = Scan(np.ones((3, *SHAPE)), Exposures.of(views, 20.0, 0.01), np.zeros(3))
+    prior = hs.MaterialPrior.of_ratio(500.0)
+    for call, what in (
+        (lambda: hs.reconstruct(scan, prior, hs.methods.Auto()), "the method auto"),
+        (lambda: hs.reconstruct(scan, prior, hs.Gaussians()), "the method gaussians"),
+        (lambda: hs.align_views(scan, prior), "finding poses"),
+        (lambda: find_axis(scan), "finding the rotation axis"),
+    ):
+        with pytest.raises(InputError, match=f"{what} needs parallel beams, but these diverge from a source 0.001 m"):
+            call()

@@ -218,15 +218,13 @@ def test_a_source_near_by_makes_pixels_and_distance_smaller(tmp_path, caplog):
     scan = read_scan(of_library(tmp_path / "b.nxs", known))
     assert scan.views.pixel_size == pytest.approx(1e-6)
     np.testing.assert_allclose(scan.exposures.distance, 0.05)
-    with pytest.raises(InputError, match="cone of rays"):
-        read_scan(
-            of_library(
-                tmp_path / "c.nxs",
-                {"instrument/source/distance": (-1e-3, "m"), "instrument/detector/distance": (1e-4, "m")},
-            )
-        )
+    near = {"instrument/source/distance": (-1e-3, "m"), "instrument/detector/distance": (1e-4, "m")}
+    cone = read_scan(of_library(tmp_path / "c.nxs", near))
+    assert cone.views.sources.tolist() == [1e-3] * len(cone)
+    assert cone.views.pixel_size == pytest.approx(PIXEL / 1.1)
     far = read_scan(of_library(tmp_path / "d.nxs", {"instrument/source/distance": (-145.0, "m")}))
     assert far.views.pixel_size == pytest.approx(PIXEL)
+    assert far.views.sources is None
 
 
 @pytest.mark.parametrize(

@@ -211,6 +211,7 @@ def _search_axis(scan: Scan, sinograms: Sinograms, options: AxisOptions, on_prog
 def sinograms_of(scan: Scan, options: AxisOptions, ratio: float | None, light: LightOptions) -> Sinograms:
     """The sinograms of `scan`, in bands of rows; errors: those of `find_axis`."""
     views = scan.views
+    scan.views.parallel("finding the rotation axis")
     require(
         views.shares_axis,
         "the axis is that of views which turn about the object's y axis alone, but these do not; align without "

@@ -138,6 +138,7 @@ def align_beams(
     time, and none unless it is beyond doubt. Errors: `InputError` for beams of a series that are never seen twice, and
     for fewer than two training frames of a time.
     """
+    scan.views.parallel("finding poses")
     beams, held = Beams.of(scan), options.uncertain.distance > 0 or options.uncertain.magnification > 0
     options = replace(options, uncertain=replace(options.uncertain, distance=0.0, magnification=0.0))
     moments = [_divide_light(moment, light) for moment in chosen_moments(scan, beams, options.times, FEWEST)]
@@ -375,6 +376,7 @@ def align_views(
         (8, 7)
         >>> moved = scan.with_views(found.exposures.views)
     """
+    scan.views.parallel("finding poses")
     train = ~scan.is_test
     posed = options.uncertain.distance == 0 and options.uncertain.magnification == 0
     few = posed and bool(train.any()) and int(train.sum()) < FEW and plane_angles(scan.views) is not None

@@ -92,6 +92,7 @@ def art(
     Views follow each other by the golden section, so that successive ones differ. Bounds are imposed after each view
     (the same authors' partially constrained ART: not below zero, unless `options` say otherwise, or it is `two_sided`).
     """
+    views.parallel("ART")
     top, rays = checked_upper(upper), rays_of(lines, views, grid, missing=missing)
     lowest = 0.0 if options.nonnegative and not two_sided else None
     with memory_kept():

@@ -51,6 +51,7 @@ def filtered_backprojection(
     `upper` are cut. Views without a common axis are refused. A filter needs all rays: those of missing pixels take what
     the volume of the others by `sirt` says.
     """
+    views.parallel("filtered back-projection")
     require(
         views.shares_axis,
         "filtered back-projection needs views that turn about the y axis only, at one height, on pixels of one size; "

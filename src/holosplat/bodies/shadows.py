@@ -46,7 +46,7 @@ class Shadows:
     @classmethod
     def of(cls, scan: Scan, material: DeltaBeta, first: float, last: float) -> Shadows:
         """The shadows in the frames of `scan`, of pixels of one size; first, last: times [s] of the whole scan."""
-        exposures, views, pitch = scan.exposures, scan.views, scan.views.pixel_size
+        exposures, views, pitch = scan.exposures, scan.views.parallel("the search for bodies"), scan.views.pixel_size
         frames = torch.from_numpy(scan.frames)
         how = Tikhonov(prior=FIXED)  # bodies are cut by the frames' edges
         thickness = tikhonov(frames, exposures, *material, options=how, missing=scan.gaps).double() / pitch

@@ -159,7 +159,7 @@ class Beams:
         shifts = shifts if in_pixels is None else sizes[:, None] * in_pixels[index]
         views = replace(planned.views, rotations=rotations, shifts=shifts)
         if pixels is not None:
-            views = Views.of_pixels(rotations, shifts, views.shape, sizes)
+            views = replace(Views.of_pixels(rotations, shifts, views.shape, sizes), sources=views.sources)
         distance, energy = self.said("distance_m"), self.said("energy_kev")
         return replace(
             planned,

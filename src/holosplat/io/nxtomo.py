@@ -19,6 +19,7 @@ from ..units import wavelength
 from ..version import __version__
 from .hdf5_writing import new_hdf5, put, room_for
 from .light import LIGHT, write_divided_light
+from .nxtomo_geometry import CONE
 from .raw_file import NOTHING, PROJECTION, RAW_TAKES, Loader
 from .scan_file import ANGLES, DATA, FLIPS, IMAGE_KEY, MASK, SPLIT, open_scan
 from .stored_frames import reader
@@ -190,6 +191,8 @@ def _write_instrument(instrument: h5py.Group, exposures: Exposures, raw: RawLayo
     same = bool((exposures.distance == exposures.distance[0]).all())  # a scalar is what most programs expect
     _put(detector, "distance", exposures.distance[0] if same else exposures.distance, "m")
     _put(detector, "shift", exposures.views.shifts, "m")
+    if views.sources is not None:
+        _put(detector, CONE.rsplit("/", 1)[1], views.sources, "m")
     _put(detector, "psf_sigma", exposures.psf_sigma_px, "px")
     return data
 

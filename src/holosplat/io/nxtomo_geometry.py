@@ -12,10 +12,12 @@ from ..checks import InputError, note, require, warn
 from ..geometry import Views
 from ..units import ANGLE_UNITS, LENGTH_UNITS, format_length, unit_factor
 from .hdf5 import Fields, attribute_text
-from .raw_file import magnified, said
+from .raw_file import Magnified, magnified, said
 
 FLIPS = ("instrument/detector/y_flipped", "instrument/detector/x_flipped")
 SHIFT = "instrument/detector/shift"
+CONE = "instrument/detector/source_distance"
+"""From source to sample, of cones of rays; pixels and distances are then those of waves in parallel beams."""
 AXIS = ("instrument/detector/x_rotation_axis_pixel_position", "instrument/detector/estimated_cor_from_motor")
 """Columns from the middle of a frame, as it is stored, to the axis."""
 VIEW = "instrument/detector/field_of_view"
@@ -116,11 +118,9 @@ def tell_moves(fields: Fields, per_frame: Callable[[str], np.ndarray], pixel: fl
 
 def magnification(
     fields: Fields, per_frame: Callable[[str], np.ndarray], detector: str, given: Mapping[str, Any]
-) -> np.ndarray | float:
+) -> Magnified:
     """(R + z) / R of a source R before the sample, and the detector z behind it, [n] or one number; both as they are
-    given (`Told.source_distance`), or else as the file says.
-
-    Errors: `InputError` for a cone of rays too wide for parallel ones, and for a distance that cannot be.
+    given (`Told.source_distance`), or else as the file says. Errors: `InputError` for a distance that cannot be.
     """
     name, told = fields.find(*SOURCES), given.get("source_distance")
     if told is not None:
@@ -128,10 +128,10 @@ def magnification(
         behind = said(given, "distance")
     else:
         if name is None or not fields.find(detector):
-            return 1.0
+            return Magnified(1.0, None)
         source = np.abs(fields.numbers(name).reshape(-1)) * fields.unit(name, LENGTH_UNITS, "m")
         if not (np.isfinite(source).all() and source.any()):
-            return 1.0
+            return Magnified(1.0, None)
         label, before, behind = fields.label(name), float(source[0]), None
     if behind is None:
         behind = np.abs(per_frame(fields.need(detector))) * fields.unit(detector, LENGTH_UNITS, "m")

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
-from ..checks import InputError, UnsaidError, in_range, note, require
+from ..checks import UnsaidError, in_range, note, require
 from ..divided_light import DividedLight
 from ..geometry import Views, rotation_y
 from ..preprocess.flat_field import mean_frame
@@ -30,6 +30,16 @@ PARALLEL = 1.001
 """A smaller magnification is that of a parallel beam."""
 WIDEST = 0.02
 """Tangent of half the angle of a cone of rays, at most, that is taken for parallel at the object."""
+
+
+class Magnified(NamedTuple):
+    """by: magnification, a number or one for each frame; source: distance [m] of the source of a cone whose rays are
+    not taken for parallel, or None."""
+
+    by: float | np.ndarray
+    source: float | None
+
+
 RAW_TAKES = (*TAKES, "leave_out")
 """The same for files whose flats and darks are read frame by frame."""
 NOTHING: Mapping[str, Any] = {}
@@ -187,33 +197,32 @@ def stand_in(*names: str) -> dict[str, float]:
     return {name: STAND_INS[name] for name in names}
 
 
-def magnified(
-    label: str, source: float, distance: float | np.ndarray, pixel: float, shape: Sequence[int]
-) -> float | np.ndarray:
+def magnified(label: str, source: float, distance: float | np.ndarray, pixel: float, shape: Sequence[int]) -> Magnified:
     """Magnification (R + z) / R of a source R before the sample, of detectors z behind it; 1 for a parallel beam.
 
     label: what messages call the source; source, distance: R and z [m]; pixel: of the detector [m]; shape: of frames.
-    Distance and pixel over it are those of the parallel beam of the same frames (`optics.coherence`), where the object
-    is thin against R. Errors: `InputError` for a cone of rays too wide for that, and a distance that cannot be.
+    Distance and pixel over it are those of the parallel beam of the same waves (`optics.coherence`). Rays are parallel,
+    too, where the object is thin against R, which is taken for so up to `WIDEST`. Errors: `InputError` for a distance
+    that cannot be.
     """
     before = in_range(label, source, 1e-6, FARTHEST_M, unit="metres")
     found = 1 + np.asarray(distance, dtype=np.float64) / before
     if found.max() < PARALLEL:
-        return 1.0
+        return Magnified(1.0, None)
     half = 0.5 * max(shape)
     tangent = half * pixel / (before * float(found.min()))
-    if tangent > WIDEST:
-        raise InputError(
-            f"{label}: a source {before:.4g} m before the sample makes a cone of rays, tangent of half its angle "
-            f"{tangent:.2g}, but beams are parallel here (up to {WIDEST}); crop the frames, or leave it out if the "
-            "beam is parallel."
+    if wide := tangent > WIDEST:
+        rays = f"rays are those of a cone, tangent of half its angle {tangent:.2g}"
+    else:
+        rays = (
+            "rays are taken for parallel: at the frames' edge, the front and the back of an object as deep as they are "
+            f"wide lie {2 * tangent * half:.2g} pixels apart"
         )
     note(
         f"{label}: the source is {before:.4g} m before the sample; pixels and distance at the detector are divided by "
-        f"the magnification of {float(found.max()):.4g}; at the frames' edge, the front and the back of an object as "
-        f"deep as they are wide lie {2 * tangent * half:.2g} pixels apart, which is not modelled"
+        f"the magnification of {float(found.max()):.4g}; {rays}"
     )
-    return found if found.ndim else float(found)
+    return Magnified(found if found.ndim else float(found), before if wide else None)
 
 
 def require_said(label: str, missing: Sequence[str]) -> None:
@@ -252,13 +261,14 @@ def exposures_of(
     told = {name: said({name: found.get(name) if given.get(name) is None else given[name]}, name) for name in RANGES}
     values = {name: value for name, value in told.items() if value is not None}
     require_said(label, [name for name in RANGES if name not in values])
-    told_source = given.get("source_distance")
+    told_source, cone = given.get("source_distance"), None
     if (source := found.get("source_distance") if told_source is None else told_source) is not None:
         own = {name for name in ("distance", "pixel_size") if told_source is not None or given.get(name) is None}
         behind, pixel = ((values if name in own else found).get(name, 0.0) for name in ("distance", "pixel_size"))
         where = f"{label}: the source" if told_source is None else "--source-distance"
         larger = magnified(where, source, behind, pixel, shape)
-        values |= {name: values[name] / float(larger) for name in own}
+        values |= {name: values[name] / float(larger.by) for name in own}
+        cone = larger.source
     angles = given["angles_deg"] if given.get("angles_deg") is not None else found.get("angles_deg")
     if angles is None and int(projections.sum()) == 1:
         angles = np.zeros(1)
@@ -275,6 +285,7 @@ def exposures_of(
     )
     turned = rotation_y(angles)
     views = Views.from_rotations(turned, shape, values["pixel_size"])
+    views = views if cone is None else replace(views, sources=np.full(count, cone))
     return Exposures.of(views, values["energy_kev"], values["distance"])
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +22,15 @@ from ..units import ANGLE_UNITS, BEAM_RANGE_KEV, ENERGY_UNITS, LENGTH_UNITS, PLA
 from .angles import tell_steps
 from .hdf5 import Fields, attribute_text, open_hdf5
 from .light import read_divided_light
+from .nxtomo_geometry import CONE, SHIFT, about_axis, flips_of, magnification, tell_moves
 from .nxtomo_geometry import FLIPS as FLIPS
-from .nxtomo_geometry import SHIFT, about_axis, flips_of, magnification, tell_moves
 from .raw_file import (
     DARK,
     FLAT,
     INVALID,
     NOTHING,
     PROJECTION,
+    Magnified,
     ScanFile,
     angles_of_projections,
     require_said,
@@ -222,18 +224,27 @@ def _optional(
 
 
 def _views(fields: Fields, kinds: np.ndarray, given: Mapping[str, Any]) -> Views:
+    views, cone = _placed(fields, kinds, given)
+    if cone is not None:
+        return replace(views, sources=np.full(len(views), cone))
+    if not fields.find(CONE):
+        return views
+    return replace(views, sources=_per_frame(fields, kinds, CONE) * fields.unit(CONE, LENGTH_UNITS, "m"))
+
+
+def _placed(fields: Fields, kinds: np.ndarray, given: Mapping[str, Any]) -> tuple[Views, float | None]:
+    """The views with parallel rays, and the distance [m] of the source where they are not, and it magnifies."""
     shape = fields.dataset(fields.need(*DATA_NAMES)).shape[1:]
     shifts = _optional(fields, kinds, SHIFT, LENGTH_UNITS, "m", (2,))
-    pixel_size = (said(given, "pixel_size") or _pixel_sizes(fields, kinds)) / _magnification(
-        fields, kinds, given, "pixel_size", PIXEL_SIZES[:2]
-    )
+    larger = _magnification(fields, kinds, given, "pixel_size", PIXEL_SIZES[:2])
+    pixel_size = (said(given, "pixel_size") or _pixel_sizes(fields, kinds)) / larger.by
     tell_moves(fields, lambda name: _per_frame(fields, kinds, name), float(np.min(pixel_size)))
     if given.get("angles_deg") is not None or not fields.find(ROTATION):
         views = Views.of_pixels(_rotations_of_angles(fields, kinds, given), shifts, shape, pixel_size)
-        return views if fields.find(SHIFT) else about_axis(fields, views)
+        return views if fields.find(SHIFT) else about_axis(fields, views), larger.source
     rotations = _per_frame(fields, kinds, ROTATION, (3, 3))
     try:
-        return Views.of_pixels(rotations, shifts, shape, pixel_size)
+        return Views.of_pixels(rotations, shifts, shape, pixel_size), larger.source
     except InputError as error:
         raise InputError(f"{fields.label(ROTATION)}: {error}") from None
 
@@ -307,7 +318,7 @@ def _energies(fields: Fields, kinds: np.ndarray, given: Mapping[str, Any]) -> np
 
 def _distances(fields: Fields, kinds: np.ndarray, given: Mapping[str, Any]) -> np.ndarray:
     told = said(given, "distance")
-    larger = _magnification(fields, kinds, given, "distance", DISTANCES[:1])
+    larger = _magnification(fields, kinds, given, "distance", DISTANCES[:1]).by
     if told is not None:
         return np.full(int((kinds == PROJECTION).sum()), told) / larger
     distances = _distances_of_file(fields, kinds) / larger
@@ -323,14 +334,14 @@ def _distances_of_file(fields: Fields, kinds: np.ndarray) -> np.ndarray:
 
 def _magnification(
     fields: Fields, kinds: np.ndarray, given: Mapping[str, Any], quantity: str, effective: tuple[str, ...]
-) -> np.ndarray | float:
+) -> Magnified:
     """(R + z) / R of a source R before the sample, by which pixels and distance are divided; 1 for a parallel beam, and
     where the file has one of the `effective` names, or the quantity is said without the source."""
     told = said(given, quantity) is not None
     if told and given.get("source_distance") is None:
-        return 1.0
+        return Magnified(1.0, None)
     if not told and fields.find(*(name.format(axis) for name in effective for axis in "xy")):
-        return 1.0
+        return Magnified(1.0, None)
     return magnification(fields, lambda name: _per_frame(fields, kinds, name), DISTANCES[1], given)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -128,7 +128,8 @@ def beam_table(scan: Scan) -> dict[str, Any]:
 def exposure_table(exposures: Exposures, n: int) -> dict[str, Any]:
     """Frame `n`: `rotation` [3, 3], `shift_m` [2], `distance_m`, `psf_sigma_px`, `time_s`; floats are kept exactly.
 
-    `energy_kev` and `pixel_size_m` too, where frames have several, and `bandwidth`, where any has one.
+    `energy_kev` and `pixel_size_m` too, where frames have several, `bandwidth`, where any has one, and `source_m`, of
+    cones of rays.
     """
     views = exposures.views
     energy = {} if exposures.has_one_energy else {"energy_kev": float(exposures.energy_kev[n])}
@@ -141,6 +142,7 @@ def exposure_table(exposures: Exposures, n: int) -> dict[str, Any]:
         "distance_m": float(exposures.distance[n]),
         "psf_sigma_px": float(exposures.psf_sigma_px[n]),
         "time_s": float(exposures.time[n]),
+        **({} if views.sources is None else {"source_m": float(views.sources[n])}),
         **({"bandwidth": float(exposures.bandwidth[n])} if np.any(exposures.bandwidth) else {}),
     }
 
@@ -148,8 +150,9 @@ def exposure_table(exposures: Exposures, n: int) -> dict[str, Any]:
 def read_exposures(beam: Table, frames: Sequence[Table], shape: tuple[int, int]) -> Exposures:
     """Exposures of frames of `shape` (H, W) from what `beam_table` and `exposure_table` wrote.
 
-    Written by hand, a frame may have `angle_deg` instead of `rotation`; `energy_kev`, `distance_m`, `pixel_size_m` and
-    `psf_sigma_px` may stand in the beam's table, for all frames; shift, blur and time are 0 where they are left out.
+    Written by hand, a frame may have `angle_deg` instead of `rotation`; `energy_kev`, `distance_m`, `pixel_size_m`,
+    `psf_sigma_px` and `source_m` may stand in the beam's table, for all frames; shift, blur and time are 0 where left
+    out.
     """
     values = [[_per_frame(beam, f, name, default) for f in frames] for name, default in _NUMBERS]
     shifts = [f.numbers("shift_m", (2,)) if "shift_m" in f else np.zeros(2) for f in frames]
@@ -157,6 +160,8 @@ def read_exposures(beam: Table, frames: Sequence[Table], shape: tuple[int, int])
     pixel_sizes = np.array([_per_frame(beam, f, "pixel_size_m", None) for f in frames])
     try:
         views = Views.of_pixels(np.array(rotations), np.array(shifts), shape, pixel_sizes)
+        if "source_m" in beam or any("source_m" in f for f in frames):
+            views = replace(views, sources=np.array([_per_frame(beam, f, "source_m", None) for f in frames]))
         energy, distance, psf_sigma, time, bandwidth = (np.array(v) for v in values)
         return Exposures(views, energy, distance, psf_sigma, time, bandwidth=bandwidth)
     except InputError as error:

@@ -29,6 +29,7 @@ class Taps:
     @classmethod
     def of(cls, grid: Grid, views: Views) -> Taps:
         """Those of the centres of `grid` in `views`, each on pixels of its own size."""
+        views.parallel("a network's guess")
         h, w = views.shape
         x, y, z = (torch.from_numpy(np.ascontiguousarray(axis)) for axis in grid.axes())
         index, weight = [], []

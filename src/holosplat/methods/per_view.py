@@ -59,6 +59,7 @@ def svmbir_volume(
     qGGMRF prior, multi-resolution coordinate descent (Bouman & Sauer 1996; svmbir). The views must turn about y only
     and share one detector shift, the grid must be cubic, with the detector's rows and its middle on the rotation axis.
     """
+    views.parallel("svmbir")
     program, pitch = _svmbir(), views.pixel_size
     views, grid = in_pixels(lines, views, grid)
     _check(views, grid)
@@ -122,6 +123,7 @@ class PerView(Method):
     """Phase retrieval of each view, then tomography, on voxels of one pixel; the occupancy of one material."""
 
     kind: ClassVar[str] = "per-view"
+    cones: ClassVar[bool] = True
     two_sided: ClassVar[bool] = True
 
     retrieval: str = "tikhonov"

@@ -39,6 +39,7 @@ class HolographicVoxels(Method):
     """Phase retrieval and total variation, made to agree with the holograms: the start of the Gaussians, by itself."""
 
     kind: ClassVar[str] = "holographic-tv"
+    cones: ClassVar[bool] = True
     any_backend: ClassVar[bool] = True
     two_sided: ClassVar[bool] = True
 
@@ -122,6 +123,7 @@ class Voxels(Method):
     """
 
     kind: ClassVar[str] = "voxels"
+    cones: ClassVar[bool] = True
     two_sided: ClassVar[bool] = True
 
     volume: HolographicTV = field(default_factory=HolographicTV)

@@ -82,8 +82,10 @@ def views_seeing(exposures: Exposures, grid: Grid) -> np.ndarray:
     half = 0.5 * views.fields - fringes(exposures)[:, None]
     found = np.zeros(grid.shape, dtype=np.uint16)
     rows = y[:1] if views.shares_axis else y  # all rows then have the same columns
-    for rotation, shift, (width, height) in zip(views.rotations, views.shifts, half):
-        column, row = (a[0] * x + a[1] * rows[:, None] + a[2] * z[:, None, None] - s for a, s in zip(rotation, shift))
+    for v, (rotation, shift, (width, height)) in enumerate(zip(views.rotations, views.shifts, half)):
+        column, row, depth = (a[0] * x + a[1] * rows[:, None] + a[2] * z[:, None, None] for a in rotation)
+        larger = 1.0 if views.sources is None else 1 + depth / views.sources[v]
+        column, row = column / larger - shift[0], row / larger - shift[1]
         row = y[:, None] - shift[1] if views.shares_axis else row
         found += (np.abs(column) <= width) & (np.abs(row) <= height)
     return found

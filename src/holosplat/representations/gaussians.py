@@ -134,6 +134,7 @@ class GaussianCloud:
         Views are checked, Poses (on the cloud's device) are taken as they are, without waiting for a GPU. Gradients
         reach the cloud's parameters, and the rotations, shifts and scales of Poses that require them.
         """
+        views.parallel("a cloud of Gaussians")
         poses = Poses.of(views, self.centres.device) if isinstance(views, Views) else views
         scale = self.unit_length / poses.pitch
         return splat(

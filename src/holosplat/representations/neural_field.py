@@ -236,6 +236,7 @@ class NeuralField:
         The gradient of poses is that of the samples as they move through the field; it leaves out what a sample adds or
         takes where it enters or leaves the mask.
         """
+        views.parallel("a neural field")
         unknown = isinstance(views, Poses) and views.requires_grad
         rays = self.raster(views if unknown or isinstance(views, Views) else views.views())
         images = torch.stack([self._image(rays, v) for v in range(len(views))])

@@ -128,9 +128,9 @@ class SurfaceMesh:
         vertices = self.vertices * (self.unit_length / pitch)
         placed = (poses.rotations, poses.shifts / pitch, poses.shape, self.lines, self.backend)
         trusted = self.backend == "cuda" and not isinstance(views, Views)
-        enclosed = [
-            surface_thickness(vertices, faces, *placed, pixels=poses.scales, trusted=trusted) for faces in self.steps
-        ]
+        sources = None if poses.sources is None else poses.sources / pitch
+        edges = {"pixels": poses.scales, "sources": sources}
+        enclosed = [surface_thickness(vertices, faces, *placed, **edges, trusted=trusted) for faces in self.steps]
         return LineIntegrals(_shares(enclosed, dim=1), self.matter.in_lengths(pitch))
 
     def voxelise(self, grid: Grid) -> Volume:

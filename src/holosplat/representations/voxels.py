@@ -17,7 +17,7 @@ from ..checks import require
 from ..display import of_object
 from ..geometry import Grid, Poses, Views
 from ..matter import Matter
-from ..projectors.voxels import LatticeProjector, SliceProjector
+from ..projectors.voxels import LatticeProjector, RayProjector, SliceProjector
 from ..volume import LineIntegrals, Volume
 
 SAME = 0.9
@@ -35,7 +35,8 @@ class VoxelLines:
     Views about the y axis: across the axis exact strip integrals over the pixels asked for (`SliceProjector`), along
     it linear between the rows of voxels. Any other poses: hats of a voxel's size (`LatticeProjector`) from the voxels
     and from the corners between them, half the mass each. That body-centred lattice halves the ripple that a simple
-    one leaves on rotated rasters. Voxels larger than the pixels asked for are interpolated to their size first.
+    one leaves on rotated rasters. Voxels larger than the pixels asked for are interpolated to their size first. Cones:
+    a ray to every pixel (`RayProjector`).
 
     `Poses` are unknown where gradients of their rotations or shifts are asked for. They are taken as they are now: make
     new lines when they change. They always go through the lattice, be they about the y axis or not, because strip
@@ -45,7 +46,9 @@ class VoxelLines:
     def __init__(self, grid: Grid, views: Views | Poses, backend: str = "cpu") -> None:
         self.grid = grid
         known = views.views() if isinstance(views, Poses) and not views.requires_grad else views
-        if isinstance(known, Views) and known.shares_axis:
+        if known.sources is not None:
+            self._lines = RayProjector(grid, known, backend).lines
+        elif isinstance(known, Views) and known.shares_axis:
             self._lines = _AboutAxis(grid, known, backend)
         else:
             self._lines = _AnyPose(grid, known, backend)

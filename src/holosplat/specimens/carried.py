@@ -297,6 +297,7 @@ class CarriedScene:
 
     def project(self, views: Views) -> LineIntegrals:
         """Line integrals of each of the scene's `kinds`, float64: sums of points `step` apart on the pixels' rays."""
+        views.parallel("a specimen carried by a flow")
         kinds = self.scene.kinds
         channels = np.zeros((len(views), len(kinds), *views.shape))
         count = int(np.ceil(2 * self.reach / self.step))

@@ -234,6 +234,7 @@ class ContinuousScene:
 
     def project(self, views: Views) -> LineIntegrals:
         """Line integrals of each of `kinds`, float64: the mean of `RAYS`² exact ones a pixel."""
+        views.parallel("a continuous specimen")
         fine, kinds = views.refined(RAYS), self.kinds
         channels = np.zeros((len(views), len(kinds), *fine.shape))
         for v in range(len(views)):

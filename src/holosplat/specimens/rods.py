@@ -97,6 +97,7 @@ class RodScene:
 
     def project(self, views: Views) -> LineIntegrals:
         """Thickness of the union, [V, 1, H, W] float64 in metres: the mean of `RAYS`² exact ones a pixel."""
+        views.parallel("a specimen of rods")
         fine, lines = views.refined(RAYS), np.zeros((len(views), *views.refined(RAYS).shape))
         height, width = fine.shape
         for v, (rotation, (sx, sy), p) in enumerate(zip(fine.rotations, fine.shifts, fine.pixel_sizes)):

@@ -88,8 +88,7 @@ class MeshScene:
     def missing_field(self, views: Views) -> float:
         """How far [m] the scene reaches beyond the detector in the worst view (0 or less: it fits)."""
         vertices = np.concatenate([m.vertices for m in self.meshes])
-        lab = np.einsum("vij,pj->vpi", views.rotations, vertices)[..., :2] - views.shifts[:, None]
-        return float((np.abs(lab) - 0.5 * views.fields[:, None]).max())
+        return float((np.abs(_seen(vertices, views)) - 0.5 * views.fields[:, None]).max())
 
     def _soup(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[tuple[float, float], ...]]:
         """All meshes as one: vertices [P, 3], faces [F, 3], and the matter of each face's body, [C, F] of C kinds.
@@ -163,7 +162,8 @@ class VoxelScene:
                 continue
             shift = views.shifts[v] + (0.5 * (first + last) - 0.5 * counts) * p
             (w, h), (column, row) = last - first, first
-            part = Views(views.rotations[[v]], shift[None], (h, w), float(p))
+            one = views[[v]]
+            part = Views(one.rotations, shift[None], (h, w), float(p), sources=one.sources)
             cast = voxel_line_integrals(values, self.volume.grid, part, step=STEP)
             lines[v, :, row : row + h, column : column + w] = cast[0]
         return LineIntegrals(lines, kinds)
@@ -206,4 +206,11 @@ class VoxelScene:
 def _corners(bounds: tuple[np.ndarray, np.ndarray], views: Views) -> np.ndarray:
     """The corners [V, 8, 2] of a box on each view's detector [m], from its middle."""
     corners = np.stack(np.meshgrid(*zip(*bounds), indexing="ij"), -1).reshape(-1, 3)
-    return np.einsum("vij,pj->vpi", views.rotations, corners)[..., :2] - views.shifts[:, None]
+    return _seen(corners, views)
+
+
+def _seen(points: np.ndarray, views: Views) -> np.ndarray:
+    """Where points [P, 3] are seen on each view's detector [V, P, 2] [m], from its middle."""
+    lab = np.einsum("vij,pj->vpi", views.rotations, points)
+    seen = lab[..., :2] if views.sources is None else lab[..., :2] / (1 + lab[..., 2:] / views.sources[:, None, None])
+    return seen - views.shifts[:, None]

@@ -153,12 +153,18 @@ def _on_one_raster(parts: list[Exposures], pixel_size: float | None) -> tuple[Ex
 def _exposures(
     parts: list[Exposures], shape: tuple[int, int], pixel_size: float | np.ndarray, blurs: np.ndarray
 ) -> Exposures:
+    sources = [part.views.sources for part in parts if part.views.sources is not None]
+    require(
+        len(sources) in (0, len(parts)),
+        f"files must all have cones of rays or none, but {len(sources)} of {len(parts)} have them; join those apart.",
+    )
     views = Views.of_pixels(
         np.concatenate([part.views.rotations for part in parts]),
         np.concatenate([part.views.shifts for part in parts]),
         shape,
         pixel_size,
     )
+    views = replace(views, sources=np.concatenate(sources)) if sources else views
     energy, distance, time, bandwidth = (
         np.concatenate([getattr(part, name) for part in parts])
         for name in ("energy_kev", "distance", "time", "bandwidth")

@@ -103,6 +103,10 @@ def reconstruct(
     """
     if not method.of_series:
         require_one_time(scan)
+    if not method.cones:
+        scan.views.parallel(f"the method {method.kind}")
+    if refine is not None:
+        scan.views.parallel("finding poses")
     check_frames(scan.train())
     if not resume:  # a run that goes on may be past them
         method.require_files()

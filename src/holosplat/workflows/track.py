@@ -93,6 +93,7 @@ def track(
         >>> print(f"{(last - first)[1] / times[-1]:.2f} m/s")
         0.05 m/s
     """
+    scan.views.parallel("following motion")
     require(
         not isinstance(prior, KnownSeveral), "bodies are of one material, but several are known; give --material once."
     )
@@ -223,6 +224,7 @@ def reconstruct_moving(
     for bit, as if nothing had happened. Errors: `InputError` for a scan of one or two times, frames that are not
     relative to the flat field, two materials, and folders that do not fit.
     """
+    scan.views.parallel("following motion")
     require(
         not isinstance(prior, KnownSeveral), "a flow carries one material, but several are known; give --material once."
     )

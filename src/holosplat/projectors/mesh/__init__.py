@@ -12,6 +12,7 @@ from torch import Tensor
 from ...backends import device
 from ...checks import require, shaped
 from ...geometry import Grid, Views
+from .. import obliquity
 from . import on_device
 from .reference import mean_depths, occupancy
 
@@ -24,19 +25,23 @@ def mesh_line_integrals(
     """Line integrals [V, C, H, W] in metres × value, float64, of closed meshes with piecewise constant values.
 
     vertices: [P, 3] object frame [m]; faces: [F, 3] outward-oriented; face_values: [C, F], the value (δ, β, 1 …)
-    inside the closed surface that each face belongs to. A pixel is the mean over `rays × rays` parallel rays
-    through it. Overlapping bodies add up. Along a ray the depth inside a closed surface is
-    `Σ sign(n·z) z_hit` over the faces it crosses. backend: resolved; numpy computes for all but `cuda`, for which torch
-    does, on the GPU.
+    inside the closed surface that each face belongs to. A pixel is the mean over `rays × rays` rays through it.
+    Overlapping bodies add up. Along a ray the depth inside a closed surface is `Σ sign(n·z) z_hit` over the faces it
+    crosses. In cones points go to `(x, y, z) / (1 + z / R)`, which keeps planes planes and makes rays parallel, and
+    depths come back at the hits. backend: resolved; numpy computes for all but `cuda`, for which torch does, on the
+    GPU.
     """
     _check(vertices, faces, face_values, rays)
     if backend == "cuda":
         return _on_gpu(vertices, faces, face_values, views, rays)
     out = np.empty((len(views), len(face_values), *views.shape))
     for v in range(len(views)):
-        lab = vertices @ views.rotations[v].T
+        lab, bent = vertices @ views.rotations[v].T, _bent(views, v)
+        lab /= 1 + bent * lab[:, 2:]
         lab[:, :2] -= views.shifts[v]
-        out[v] = mean_depths(lab, faces, face_values, views.shape, float(views.pixel_sizes[v]), rays)
+        out[v] = mean_depths(lab, faces, face_values, views.shape, float(views.pixel_sizes[v]), rays, bent)
+        if bent:
+            out[v] *= _obliquity(views, v).numpy()
     return torch.from_numpy(out)
 
 
@@ -45,10 +50,23 @@ def _on_gpu(vertices: np.ndarray, faces: np.ndarray, face_values: np.ndarray, vi
     points, corners, values = (torch.from_numpy(a).to(where) for a in (vertices, faces, face_values))
     out = values.new_empty(len(views), len(values), *views.shape)
     for v, pixel in enumerate(views.pixel_sizes.tolist()):
-        lab = points @ torch.from_numpy(views.rotations[v].T.copy()).to(where)
+        lab, bent = points @ torch.from_numpy(views.rotations[v].T.copy()).to(where), _bent(views, v)
+        lab = lab / (1 + bent * lab[:, 2:])
         lab[:, :2] -= torch.from_numpy(views.shifts[v].copy()).to(where)
-        out[v] = on_device.mean_depths(lab, corners, values, views.shape, pixel, rays)
+        out[v] = on_device.mean_depths(lab, corners, values, views.shape, pixel, rays, bent)
+        if bent:
+            out[v] *= _obliquity(views, v).to(where)
     return out
+
+
+def _bent(views: Views, v: int) -> float:
+    """One over the distance [m] of a view's source; 0 for parallel rays."""
+    return 0.0 if views.sources is None else 1 / float(views.sources[v])
+
+
+def _obliquity(views: Views, v: int) -> Tensor:
+    assert views.sources is not None
+    return obliquity(views.shape, *(torch.as_tensor(a[v]) for a in (views.pixel_sizes, views.shifts, views.sources)))
 
 
 def voxelise_meshes(

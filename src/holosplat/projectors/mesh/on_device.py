@@ -13,22 +13,27 @@ MAX_HITS = 16_000_000
 """Hits held in memory at once: some 2 GB."""
 
 
-def mean_depths(lab: Tensor, faces: Tensor, values: Tensor, shape: tuple[int, int], pitch: float, rays: int) -> Tensor:
+def mean_depths(
+    lab: Tensor, faces: Tensor, values: Tensor, shape: tuple[int, int], pitch: float, rays: int, bent: float = 0.0
+) -> Tensor:
     """[C, H, W] float64: Σ over hits of `sign · z · value`, the mean over the `rays × rays` rays of each pixel.
 
-    lab: [P, 3] vertices [m]; values: [C, F]; shape: pixels (H, W) of `pitch` [m]; float64 and int64, on one device.
+    lab: [P, 3] vertices [m], over `1 + bent z`; values: [C, F]; shape: pixels (H, W) of `pitch` [m]; bent: one over the
+    source's distance [1/m]; float64 and int64, on one device.
     """
     (h, w), fine = shape, (shape[0] * rays, shape[1] * rays)
     u = rays * lab[:, 0] / pitch + 0.5 * (fine[1] - 1) + NUDGE[0]
     v = rays * lab[:, 1] / pitch + 0.5 * (fine[0] - 1) + NUDGE[1]
     out = values.new_zeros(len(values), h * w)
-    for ray, depth, face in ray_hits(torch.stack([u, v, lab[:, 2]], 1), faces, fine):
+    for ray, depth, face in ray_hits(torch.stack([u, v, lab[:, 2]], 1), faces, fine, bent):
         row, column = ray // fine[1], ray % fine[1]
         out.index_add_(1, row // rays * w + column // rays, depth * values[:, face])
     return (out / rays**2).reshape(-1, h, w)
 
 
-def ray_hits(points: Tensor, faces: Tensor, shape: tuple[int, int]) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+def ray_hits(
+    points: Tensor, faces: Tensor, shape: tuple[int, int], bent: float
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
     """Batches of hits `(ray, depth, face)`: flat lattice index, and the depth, negative where the ray enters.
 
     points: [P, 3] as (column, row, depth), the first two in lattice units; shape: lattice (rows, columns).
@@ -40,12 +45,12 @@ def ray_hits(points: Tensor, faces: Tensor, shape: tuple[int, int]) -> Iterator[
     batch = ((last - first) * columns.clamp_max(shape[1])).cumsum(0) // MAX_HITS
     for b in batch[last > first].unique().tolist():
         face = ((batch == b) & (last > first)).nonzero()[:, 0]
-        ray, depth, owner = _scan_convert(corners[face], first[face], last[face], shape)
+        ray, depth, owner = _scan_convert(corners[face], first[face], last[face], shape, bent)
         yield ray, depth, face[owner]
 
 
 def _scan_convert(
-    corners: Tensor, first: Tensor, last: Tensor, shape: tuple[int, int]
+    corners: Tensor, first: Tensor, last: Tensor, shape: tuple[int, int], bent: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Hits of the triangles `corners` [F, 3, (column, row, depth)] on the rows [first, last), and whose they are."""
     a, b, c = corners.unbind(1)
@@ -68,7 +73,7 @@ def _scan_convert(
     t, row = t[r], row[r]
     depth = a[t, 2] + slope_u[t] * (column - a[t, 0]) + slope_v[t] * (row - a[t, 1])
     depth = depth.clamp(corners[..., 2].amin(1)[t], corners[..., 2].amax(1)[t])
-    return row * shape[1] + column, area.sign()[t] * depth, t
+    return row * shape[1] + column, area.sign()[t] * depth / (1 - bent * depth), t
 
 
 def _crossing(low: Tensor, high: Tensor, row: Tensor) -> Tensor:

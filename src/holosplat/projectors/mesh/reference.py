@@ -21,11 +21,18 @@ NUDGE = (3.1e-8, 7.3e-8)
 
 
 def mean_depths(
-    lab: np.ndarray, faces: np.ndarray, values: np.ndarray, shape: tuple[int, int], pitch: float, rays: int
+    lab: np.ndarray,
+    faces: np.ndarray,
+    values: np.ndarray,
+    shape: tuple[int, int],
+    pitch: float,
+    rays: int,
+    bent: float = 0.0,
 ) -> np.ndarray:
     """[C, H, W] float64: Σ over hits of `sign · z · value`, the mean over the `rays × rays` rays of each pixel.
 
-    lab: [P, 3] vertices [m]; shape: pixels (H, W) of `pitch` [m].
+    lab: [P, 3] vertices [m], over `1 + bent z`; shape: pixels (H, W) of `pitch` [m]; bent: one over the source's
+    distance [1/m].
     """
     (h, w), fine = shape, (shape[0] * rays, shape[1] * rays)
     u = rays * lab[:, 0] / pitch + 0.5 * (fine[1] - 1) + NUDGE[0]
@@ -37,7 +44,7 @@ def mean_depths(
         first, last = pixel.min(initial=h * w), pixel.max(initial=0)
         count = max(last - first + 1, 0)
         for c, value in enumerate(values):
-            out[c, first : last + 1] += np.bincount(pixel - first, sign * z * value[face], count)
+            out[c, first : last + 1] += np.bincount(pixel - first, sign * z / (1 - bent * z) * value[face], count)
     return (out / rays**2).reshape(-1, h, w)
 
 

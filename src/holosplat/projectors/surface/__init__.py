@@ -1,4 +1,4 @@
-"""Thickness of deformable closed surfaces in parallel beams, with gradients of their vertices and of the poses.
+"""Thickness of deformable closed surfaces in beams and cones, with gradients of their vertices and of the poses.
 
 Not the projector that simulations use (`projectors.mesh`), nor its arithmetic: there rays are cast through points,
 here lines are integrated over pixels.
@@ -10,6 +10,10 @@ Hadamard's formula: Delfour & Zolésio 2011, "Shapes and Geometries", chapter 9)
 edge-on, and the derivative of T is not. G is linear between pixels, so it is the derivative of the thickness
 averaged under a hat of one pixel's reach: both agree to second order in the pixel. A pose moves the surface in the lab
 frame, `p = R v - s`: its gradient is the same integral, over the motion that the pose gives each vertex.
+
+In a cone, each view sees vertices where the source casts them on the plane through the object's origin, in the depth
+that they have, and rays are longer than the depth that they cross (`projectors`). Faces stay flat there, which true
+ones do not quite: a face that is d deep errs by d² / 4R at most, R the source's distance.
 
 Backends: `cpu` (C++), `cuda` (Triton) and `reference` (plain torch), all in float64, where the vertices are.
 """
@@ -24,6 +28,7 @@ from torch.autograd.function import once_differentiable
 
 from ...backends import implementation
 from ...checks import require
+from .. import obliquity
 from .reference import occupancy
 
 __all__ = ["surface_occupancy", "surface_thickness"]
@@ -42,6 +47,7 @@ def surface_thickness(
     backend: str = "cpu",
     *,
     pixels: Tensor | None = None,
+    sources: Tensor | None = None,
     trusted: bool = False,
 ) -> Tensor:
     """Line integrals [V, H, W] of one over the inside of closed surfaces, float64; lengths in PIXELS.
@@ -49,22 +55,28 @@ def surface_thickness(
     vertices: [P, 3] float64 `(x, y, z)`, object frame; faces: [F, 3] int64, counter-clockwise seen from outside (a
     cavity's from within it); rotations [V, 3, 3], shifts [V, 2] `(sx, sy)`, float64: as for `projectors.splat`; lines:
     rows integrated in a pixel; pixels: [V] edges of the views' pixels in the unit of length, which is the pixel where
-    there are none; backend: `cpu`, `cuda` or `reference`; trusted: values are taken as they are, without waiting for a
-    GPU. Overlapping bodies add up. Gradients: of the vertices, the rotations (all nine numbers, as of any matrix), the
-    shifts and the edges; a gradient that is not required costs nothing. Errors: `InputError` for other shapes and
-    types, and, unless trusted, vertices that are not finite and faces that name others.
+    there are none; sources: [V] distances of the views' sources, none for parallel beams; backend: `cpu`, `cuda` or
+    `reference`; trusted: values are taken as they are, without waiting for a GPU. Overlapping bodies add up. Gradients:
+    of the vertices, the rotations (all nine numbers, as of any matrix), the shifts, the edges and the sources; a
+    gradient that is not required costs nothing. Errors: `InputError` for other shapes and types, and, unless trusted,
+    vertices that are not finite and faces that name others.
     """
     _check(vertices, faces, trusted)
     require(1 <= lines <= MOST_LINES, f"lines must be from 1 to {MOST_LINES}, but it is {lines}.")
     views = len(shifts)
     good = rotations.shape == (views, 3, 3) and shifts.shape == (views, 2) and min(shape) >= 0
-    good = good and (pixels is None or pixels.shape == (views,))
+    good = good and all(a is None or a.shape == (views,) for a in (pixels, sources))
     edges = "" if pixels is None else f" and {tuple(pixels.shape)}"
     require(
         good,
         "rotations, shifts and pixels must have the shapes [V, 3, 3], [V, 2] and [V], but they are "
         f"{tuple(rotations.shape)}, {tuple(shifts.shape)}{edges}, on rasters {tuple(shape)}.",
     )
+    if sources is not None:
+        edges = [None] * views if pixels is None else list(pixels)
+        poses = zip(rotations, shifts, edges, sources)
+        seen = [_in_cone(vertices, faces, pose, shape, lines, backend) for pose in poses]
+        return torch.stack(seen) if seen else vertices.new_zeros(0, *shape)
     poses, faces = (rotations.to(vertices), shifts.to(vertices)), faces.contiguous()
     if pixels is None:
         return _Thickness.apply(vertices, *poses, None, faces, shape, lines, backend)  # type: ignore[no-any-return]
@@ -73,6 +85,24 @@ def surface_thickness(
     found = _Thickness.apply(vertices, *scaled, edges.detach(), faces, shape, lines, backend)
     assert isinstance(found, Tensor)
     return found * edges[:, None, None]
+
+
+def _in_cone(
+    vertices: Tensor,
+    faces: Tensor,
+    pose: tuple[Tensor, Tensor, Tensor | None, Tensor],
+    shape: tuple[int, int],
+    lines: int,
+    backend: str,
+) -> Tensor:
+    """One view [H, W]; pose: its rotation, its shift, the edge of its pixels or None, and its source."""
+    rotation, shift, source = (a.to(vertices) for a in (pose[0], pose[1], pose[3]))
+    edge, upright = None if pose[2] is None else pose[2].to(vertices), torch.eye(3).to(vertices)[None]
+    lab = vertices @ rotation.T
+    seen = torch.cat((lab[:, :2] / (1 + lab[:, 2:] / source), lab[:, 2:]), 1)
+    one = None if edge is None else edge[None]
+    image = surface_thickness(seen, faces, upright, shift[None], shape, lines, backend, pixels=one, trusted=True)
+    return image[0] * obliquity(shape, vertices.new_ones(()) if edge is None else edge, shift, source)
 
 
 def surface_occupancy(vertices: Tensor, faces: Tensor, shape: tuple[int, int, int], lines: int = 4) -> Tensor:

@@ -1,4 +1,4 @@
-"""Ray casting through a voxel grid: a Riemann sum of trilinear samples along parallel rays, in plain torch."""
+"""Ray casting through a voxel grid: a Riemann sum of trilinear samples along parallel rays or cones, in plain torch."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from ...geometry import Grid, Views
 def voxel_line_integrals(values: Tensor, grid: Grid, views: Views, *, step: float = 0.5, rays: int = 1) -> Tensor:
     """Line integrals [V, C, H, W] in metres × value of `values` [C, Z, Y, X] on `grid`; differentiable in `values`.
 
-    step: sampling distance along the ray, in units of the smallest voxel edge; rays: `rays × rays` parallel rays
-    a pixel are averaged. Outside the grid the values are zero.
+    step: sampling distance along the ray, in units of the smallest voxel edge; rays: `rays × rays` rays a pixel
+    are averaged. Outside the grid the values are zero.
     """
     require(values.ndim == 4 and tuple(values.shape[1:]) == grid.shape, "values must have the shape (C, Z, Y, X).")
     require(step > 0 and rays >= 1, f"step must be positive and rays at least 1, but they are {step} and {rays}.")
@@ -39,12 +39,16 @@ def _cast(values: Tensor, grid: Grid, views: Views, v: int, step: float) -> Tens
     z = (np.arange(count) - count // 2) * length + float((rotation @ centre)[2])
     # x_obj = Rᵀ x_lab is affine in (x, y, z): normalised to [-1, 1] for grid_sample, one row of pixels at a time.
     to_unit = (rotation / half).astype(np.float64)
-    base = torch.as_tensor(x[None, :, None] * to_unit[0] + z[:, None, None] * to_unit[2] - centre / half)
-    rows = torch.as_tensor(y[:, None] * to_unit[1])
+    # In a cone, x and y grow with the distance from the source, and steps along the beam are longer beside its axis.
+    bent = 0.0 if views.sources is None else 1 / float(views.sources[v])
+    grown = 1 + bent * z[:, None, None]
+    base = torch.as_tensor(grown * x[None, :, None] * to_unit[0] + z[:, None, None] * to_unit[2] - centre / half)
+    rows = torch.as_tensor(grown[..., None] * (y[:, None] * to_unit[1])[None, :, None])
+    oblique = torch.as_tensor(np.sqrt(1 + bent**2 * (x**2 + y[:, None] ** 2))).to(values)
     chunk = max(1, 4_000_000 // (count * w))
     parts = []
     for start in range(0, h, chunk):
-        points = base[:, None] + rows[start : start + chunk, None, :]
+        points = base[:, None] + rows[:, start : start + chunk]
         sampled = grid_sample(values[None], points[None].to(values.dtype), align_corners=False)
         parts.append(sampled[0].sum(dim=1))
-    return torch.cat(parts, dim=1) * length
+    return torch.cat(parts, dim=1) * length * oblique

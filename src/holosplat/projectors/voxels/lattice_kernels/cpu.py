@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from .... import native
-from .frames import Lattice
+from . import Lattice
 
 
 class Kernels:
@@ -47,3 +47,30 @@ class Kernels:
 
 def _plain(array: Tensor) -> Tensor:
     return array.detach().float().contiguous()
+
+
+class Stack:
+    """Rays through slices: rays [5, N] as in `reference.Stack`."""
+
+    def __init__(self, rays: Tensor) -> None:
+        self._rays = _plain(rays)
+
+    def project(self, volume: Tensor) -> Tensor:
+        """[K, A, B] → [N]."""
+        images = torch.empty(self._rays.shape[1])
+        self._call("holosplat_rays_project", volume.shape, _plain(volume), images)
+        return images
+
+    def backproject(self, images: Tensor, volume: Tensor) -> None:
+        """The adjoint, [N] → [K, A, B], which is added to `volume`, float32 and contiguous."""
+        self._call("holosplat_rays_backproject", volume.shape, _plain(images), volume)
+
+    def gradients(self, volume: Tensor, upstream: Tensor) -> Tensor:
+        """Of the rays [5, N]; upstream [N]: of the images."""
+        found = torch.empty_like(self._rays)
+        self._call("holosplat_rays_gradients", volume.shape, _plain(volume), _plain(upstream), found)
+        return found
+
+    def _call(self, function: str, shape: torch.Size, *arrays: Tensor) -> None:
+        rays = native.Rays(*shape, self._rays.shape[1], self._rays.data_ptr())
+        native.call(function, rays, *(native.c_void_p(a.data_ptr()) for a in arrays), torch.get_num_threads())

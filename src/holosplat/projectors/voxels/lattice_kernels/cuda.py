@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from ....launch import launching
-from . import triton_lattice
-from .frames import Lattice
+from . import Lattice, triton_lattice
 
 
 class Kernels:
@@ -54,3 +53,25 @@ def _axes(lattice: Lattice, matrices: Tensor, shifts: Tensor) -> Tensor:
 
 def _plain(array: Tensor) -> Tensor:
     return array.detach().float().contiguous()
+
+
+class Stack:
+    """Rays through slices: rays [5, N] as in `reference.Stack`."""
+
+    def __init__(self, rays: Tensor) -> None:
+        self._rays = _plain(rays)
+
+    def project(self, volume: Tensor) -> Tensor:
+        """[K, A, B] → [N]."""
+        with launching(volume):
+            return triton_lattice.project_rays(self._rays, _plain(volume))
+
+    def backproject(self, images: Tensor, volume: Tensor) -> None:
+        """The adjoint, [N] → [K, A, B], which is added to `volume`, float32 and contiguous, in any order."""
+        with launching(volume):
+            triton_lattice.backproject_rays(self._rays, _plain(images), volume)
+
+    def gradients(self, volume: Tensor, upstream: Tensor) -> Tensor:
+        """Of the rays [5, N]; upstream [N]: of the images."""
+        with launching(volume):
+            return triton_lattice.ray_gradients(self._rays, _plain(volume), _plain(upstream))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .frames import KINK, SLACK, Lattice
+from . import KINK, SLACK, Lattice
 
 
 class Kernels:
@@ -61,3 +61,40 @@ def _image(lab: Tensor, shift: Tensor, values: Tensor, raster: tuple[int, int], 
         for offset, weight in ((0, (1 - a) * (1 - b)), (1, a * (1 - b)), (w, (1 - a) * b), (w + 1, a * b)):
             image = image.index_add(0, at + offset, value * weight)
     return image.reshape(h, w)
+
+
+class Stack:
+    """Rays through a stack of slices [K, A, B], whose outermost rows and columns are zeros.
+
+    rays: [5, N] in voxels: row in the middle of the stack, rows a slice, column there, columns a slice; and the ray's
+    length from slice to slice. In every slice a ray sees the four voxels around its place, bilinear; beside the slice
+    it sees the rim (Joseph 1982, *IEEE Trans. Med. Imaging* 1, 192-196).
+    """
+
+    def __init__(self, rays: Tensor) -> None:
+        self._rays = rays
+
+    def project(self, volume: Tensor) -> Tensor:
+        """[K, A, B] → [N], differentiable in the volume and in the rays."""
+        rays, (depth, height, width) = self._rays.to(volume), volume.shape
+        seen = torch.zeros_like(rays[0])
+        for k, voxels in enumerate(volume.reshape(depth, -1)):
+            row, column = (at + (k - 0.5 * (depth - 1)) * step for at, step in (rays[0:2], rays[2:4]))
+            row, column = row.clamp(0, height - 1), column.clamp(0, width - 1)
+            i, j = row.detach().long().clamp(max=height - 2), column.detach().long().clamp(max=width - 2)
+            a, b, at = column - j, row - i, i * width + j
+            for offset, weight in ((0, (1 - a) * (1 - b)), (1, a * (1 - b)), (width, (1 - a) * b), (width + 1, a * b)):
+                seen = seen + weight * voxels[at + offset]
+        return seen * rays[4]
+
+    def backproject(self, images: Tensor, volume: Tensor) -> None:
+        """The adjoint, [N] → [K, A, B], which is added to `volume`."""
+        with torch.enable_grad():
+            anything = torch.zeros_like(volume).requires_grad_()
+            volume += torch.autograd.grad(self.project(anything), anything, images.to(volume))[0]
+
+    def gradients(self, volume: Tensor, upstream: Tensor) -> Tensor:
+        """Of the rays [5, N]; upstream [N]: of the images."""
+        with torch.enable_grad():
+            rays = self._rays.detach().to(volume).requires_grad_()
+            return torch.autograd.grad(Stack(rays).project(volume.detach()), rays, upstream.to(volume))[0]

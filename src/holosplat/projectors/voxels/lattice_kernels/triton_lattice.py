@@ -19,13 +19,14 @@ import triton.language as tl
 from torch import Tensor
 
 from ..triton_places import BLOCK, WARPS, places
-from . import frames
+from . import KINK as NEAR
+from . import SLACK as BEYOND
 
 TILE = tl.constexpr(16)
 """Voxels along x and z of the tiles of `_project`; a block has as many as a tile."""
 POSE_PROGRAMS, POSE_WARPS = 512, 4
 """Programs of a view that sum over all voxels, at most, and their warps."""
-SLACK, KINK = tl.constexpr(frames.SLACK), tl.constexpr(frames.KINK)
+SLACK, KINK = tl.constexpr(BEYOND), tl.constexpr(NEAR)
 INTEGER_ARGUMENTS = ["Z", "Y", "X", "H", "W"]
 
 
@@ -185,3 +186,105 @@ def _poses(axes, volume, upstream, sums, Z, Y, X, H, W, ROUNDS, BLOCK: tl.conste
     sums += 8 * (v * tl.num_programs(0) + tl.program_id(0))
     _store_sums(sums, c, cx, cy, cz)
     _store_sums(sums + 4, r, rx, ry, rz)
+
+
+def project_rays(rays: Tensor, volume: Tensor) -> Tensor:
+    """Images [N] of slices [K, A, B] along rays [5, N] (`reference.Stack`), float32 and contiguous."""
+    images = rays.new_empty(rays.shape[1])
+    grid = (triton.cdiv(len(images), BLOCK),)
+    _project_rays[grid](rays, volume, images, len(images), *volume.shape, BLOCK, num_warps=WARPS)
+    return images
+
+
+def backproject_rays(rays: Tensor, images: Tensor, volume: Tensor) -> None:
+    """The adjoint, which is added to `volume` by atomic additions in any order."""
+    grid = (triton.cdiv(len(images), BLOCK), len(volume))
+    _backproject_rays[grid](rays, images, volume, len(images), *volume.shape, BLOCK, num_warps=WARPS)
+
+
+def ray_gradients(rays: Tensor, volume: Tensor, upstream: Tensor) -> Tensor:
+    """Gradients [5, N] of the rays; upstream [N]: of the images."""
+    found = torch.empty_like(rays)
+    grid = (triton.cdiv(len(upstream), BLOCK),)
+    _ray_gradients[grid](rays, volume, upstream, found, len(upstream), *volume.shape, BLOCK, num_warps=WARPS)
+    return found
+
+
+@triton.jit
+def _ray(rays, n, N):
+    there = n < N
+    row, row_step = tl.load(rays + n, mask=there, other=0.0), tl.load(rays + N + n, mask=there, other=0.0)
+    column, step = tl.load(rays + 2 * N + n, mask=there, other=0.0), tl.load(rays + 3 * N + n, mask=there, other=0.0)
+    return row, row_step, column, step, tl.load(rays + 4 * N + n, mask=there, other=0.0)
+
+
+@triton.jit
+def _meet(row, row_step, column, step, depth, A, B):
+    # The first of the four voxels around a ray's place in a slice, and how far (0 to 1) the place is from it.
+    y = tl.minimum(tl.maximum(row + depth * row_step, 0.0), A.to(tl.float32) - 1)
+    x = tl.minimum(tl.maximum(column + depth * step, 0.0), B.to(tl.float32) - 1)
+    i, j = tl.minimum(y.to(tl.int32), A - 2), tl.minimum(x.to(tl.int32), B - 2)
+    return i * B + j, y - i.to(tl.float32), x - j.to(tl.float32)
+
+
+@triton.jit(do_not_specialize=["N", "K", "A", "B"])
+def _project_rays(rays, volume, images, N, K, A, B, BLOCK: tl.constexpr):
+    n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    row, row_step, column, step, length = _ray(rays, n, N)
+    sum = tl.zeros((BLOCK,), tl.float32)
+    depth = -0.5 * (K.to(tl.float32) - 1)
+    for _ in range(K):
+        at, b, a = _meet(row, row_step, column, step, depth, A, B)
+        upper_left, upper_right, lower_left, lower_right = _load_four(volume, at, B, n < N)
+        upper, lower = upper_left + a * (upper_right - upper_left), lower_left + a * (lower_right - lower_left)
+        sum += upper + b * (lower - upper)
+        volume += A.to(tl.int64) * B
+        depth += 1.0
+    tl.store(images + n, sum * length, mask=n < N)
+
+
+@triton.jit(do_not_specialize=["N", "K", "A", "B"])
+def _backproject_rays(rays, images, volume, N, K, A, B, BLOCK: tl.constexpr):
+    n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    row, row_step, column, step, length = _ray(rays, n, N)
+    k = tl.program_id(1)
+    at, b, a = _meet(row, row_step, column, step, k.to(tl.float32) - 0.5 * (K.to(tl.float32) - 1), A, B)
+    value = length * tl.load(images + n, mask=n < N, other=0.0)
+    lower = value * b
+    upper = value - lower
+    to = volume + k.to(tl.int64) * A * B + at
+    kept = (n < N) & (value != 0.0)
+    tl.atomic_add(to, upper * (1 - a), mask=kept, sem="relaxed")
+    tl.atomic_add(to + 1, upper * a, mask=kept, sem="relaxed")
+    tl.atomic_add(to + B, lower * (1 - a), mask=kept, sem="relaxed")
+    tl.atomic_add(to + B + 1, lower * a, mask=kept, sem="relaxed")
+
+
+@triton.jit(do_not_specialize=["N", "K", "A", "B"])
+def _ray_gradients(rays, volume, upstream, found, N, K, A, B, BLOCK: tl.constexpr):
+    n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    row, row_step, column, step, length = _ray(rays, n, N)
+    sum = tl.zeros((BLOCK,), tl.float32)
+    down, down_deep, right, right_deep = sum, sum, sum, sum
+    depth = -0.5 * (K.to(tl.float32) - 1)
+    bottom, end = A.to(tl.float32) - 1, B.to(tl.float32) - 1
+    for _ in range(K):
+        at, b, a = _meet(row, row_step, column, step, depth, A, B)
+        upper_left, upper_right, lower_left, lower_right = _load_four(volume, at, B, n < N)
+        upper, lower = upper_left + a * (upper_right - upper_left), lower_left + a * (lower_right - lower_left)
+        sum += upper + b * (lower - upper)
+        y, x = row + depth * row_step, column + depth * step
+        free = (y > 0) & (y < bottom) & (x > 0) & (x < end)
+        by_row = tl.where(free, lower - upper, 0.0)
+        by_column = tl.where(free, (1 - b) * (upper_right - upper_left) + b * (lower_right - lower_left), 0.0)
+        down, down_deep = down + by_row, down_deep + depth * by_row
+        right, right_deep = right + by_column, right_deep + depth * by_column
+        volume += A.to(tl.int64) * B
+        depth += 1.0
+    given = tl.load(upstream + n, mask=n < N, other=0.0)
+    weighted = given * length
+    tl.store(found + n, weighted * down, mask=n < N)
+    tl.store(found + N + n, weighted * down_deep, mask=n < N)
+    tl.store(found + 2 * N + n, weighted * right, mask=n < N)
+    tl.store(found + 3 * N + n, weighted * right_deep, mask=n < N)
+    tl.store(found + 4 * N + n, given * sum, mask=n < N)
