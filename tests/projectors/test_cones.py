@@ -211,7 +211,7 @@ def test_meshes_and_surfaces_have_the_chords_of_a_ball(scales):
     wanted = chords(views)
     mesh = mesh_line_integrals(vertices, faces, np.ones((1, len(faces))), views, rays=4)[:, 0].numpy()
     assert np.sqrt(np.mean((mesh - wanted) ** 2)) < 0.005 * wanted.max()
-    found = surface_of(views, torch.from_numpy(vertices), torch.from_numpy(faces), lines=4).numpy()
+    found = surface_of(views, torch.tensor(vertices), torch.tensor(faces), lines=4).numpy()
     assert np.sqrt(np.mean((found - wanted) ** 2)) < 0.005 * wanted.max()
     assert found.sum() == pytest.approx(wanted.sum(), rel=0.005)
 
@@ -229,7 +229,7 @@ def test_a_mesh_is_seen_exactly_and_a_surface_to_the_square_of_its_faces():
     for level in (0, 1, 2):
         vertices, faces = box_of_triangles(level)
         mesh = mesh_line_integrals(vertices, faces, np.ones((1, len(faces))), views, rays=8)[:, 0]
-        found = surface_of(views, torch.from_numpy(vertices), torch.from_numpy(faces), lines=8)
+        found = surface_of(views, torch.tensor(vertices), torch.tensor(faces), lines=8)
         exact.append(mesh)
         errors.append(float((found - mesh).square().mean().sqrt()))
     assert float((exact[2] - exact[0]).abs().max()) < 1e-6

@@ -12,7 +12,7 @@ from ..checks import at_least, require
 from ..geometry import Grid, Views
 from ..memory import memory_kept
 from ..progress import Advance
-from ..projectors.voxels import LatticeProjector, SliceProjector
+from ..projectors.voxels import Projector, SliceProjector
 from ..ranges import ranged
 from .rays import Rays, bounded, checked_upper, rays_of
 
@@ -112,7 +112,7 @@ def art(
 class _View:
     """One view of ART: its projector, its lines, and for each set of orthogonal rays `1/|aᵢ|²`, zero elsewhere."""
 
-    projector: SliceProjector | LatticeProjector
+    projector: Projector
     measured: Tensor
     scales: list[Tensor]
 

@@ -13,7 +13,7 @@ from ..backends import device
 from ..checks import InputError, require
 from ..geometry import Grid, Views
 from ..matter import DeltaBeta
-from ..projectors.voxels import LatticeProjector, SliceProjector, projector_for
+from ..projectors.voxels import Projector, projector_for
 from ..scan import Exposures
 from ..units import wavenumber
 
@@ -32,7 +32,7 @@ class Rays:
     projector's order; None: all are 1.
     """
 
-    projector: SliceProjector | LatticeProjector
+    projector: Projector
     measured: Tensor
     views: Views
     grid: Grid

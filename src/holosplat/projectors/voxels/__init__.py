@@ -5,10 +5,13 @@ from .lattice import LatticeProjector, RayProjector
 from .raycast import voxel_line_integrals
 from .slices import SliceProjector, rows_match
 
-__all__ = ["LatticeProjector", "RayProjector", "SliceProjector", "projector_for", "voxel_line_integrals"]
+__all__ = ["LatticeProjector", "Projector", "RayProjector", "SliceProjector", "projector_for", "voxel_line_integrals"]
+
+Projector = SliceProjector | LatticeProjector | RayProjector
+"""Forward and exact adjoint."""
 
 
-def projector_for(grid: Grid, views: Views, backend: str = "cpu") -> SliceProjector | LatticeProjector | RayProjector:
+def projector_for(grid: Grid, views: Views, backend: str = "cpu") -> Projector:
     """The fastest linear projector that fits: rays for cones, slice matrices for views about y with matching rows, else
     the lattice.
 
