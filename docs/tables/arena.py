@@ -11,7 +11,7 @@ TRACKS = ("kernels", "steps", "retrieval", "tomography", "jobs")
 NUMBERS = ("error", "dice", "ssim", "seconds")
 
 
-@table("arena", "holosplat bench arena --size 32 --history docs/data/arena", "an hour", "arena/")
+@table("arena", "holosplat bench arena --history docs/data/arena", "an hour", "arena/")
 def arena() -> str:
     """Means over the cases of every track; those on the Pareto front in bold."""
     entry, lines = read_history(DATA / "arena")[-1], []

@@ -11,6 +11,7 @@ import pytest
 import tifffile
 
 import holosplat as hs
+from helpers.cli import holosplat
 from holosplat.align.axis import find_axis
 from holosplat.checks import InputError
 from holosplat.geometry import Views
@@ -157,3 +158,13 @@ def test_what_needs_parallel_beams_refuses_cones(tmp_path: Path):
     ):
         with pytest.raises(InputError, match=f"{what} needs parallel beams, but these diverge from a source 0.001 m"):
             call()
+
+
+def test_what_a_file_of_cones_is_next_is_a_method_for_them(tmp_path: Path):
+    views = replace(Views.evenly_spaced(3, shape=SHAPE, pixel_size=PIXEL), sources=np.full(3, 1e-3))
+    scan = Scan(np.ones((3, *SHAPE)), Exposures.of(views, 20.0, 0.01), np.zeros(3))
+    write_scan(tmp_path / "cones.nxs", scan)
+    said = holosplat("info", tmp_path / "cones.nxs").out
+    assert "0.001 m before the object, whose rays are a cone" in said
+    assert "--method tikhonov-tv" in said
+    assert "auto takes" not in said

@@ -139,7 +139,8 @@ def _facts(path: Path, reading: Reading, loader: Loader, opened: Opened, unsaid:
     rows |= look.rows()
     if look.is_light and unsaid.keys().isdisjoint(OPTICS):
         rows["fringes"] = look.fringes(fringes(scan.exposures) / scan.views.pixel_sizes)
-    if look.is_light and not unsaid:
+    cones = scan.views.sources is not None  # which the default method refuses
+    if look.is_light and not unsaid and not cones:
         rows |= _needs(scan, numbers)
     missing = list(dict.fromkeys(unsaid.values()))
     if not look.is_light:
@@ -153,7 +154,7 @@ def _facts(path: Path, reading: Reading, loader: Loader, opened: Opened, unsaid:
         )
     words = ["holosplat reconstruct", shlex.quote(str(path)), *_options(reading)]
     words += [f"--{OPTIONS.get(name, name)} …" for name in unsaid]
-    more = " ".join([*words, *(["--motion each"] if scan.is_series else []), "--out run"])
+    more = " ".join([*words, *["--motion each"] * scan.is_series, *["--method tikhonov-tv"] * cones, "--out run"])
     matter = "not in the file; --material NAME or --delta-beta RATIO says it, else δ/β is estimated"
     facts = Facts(rows | {"material": matter}, tuple(missing), (more,) if look.is_light else ())
     return ScanFacts(facts, scan, look, numbers, tuple(unsaid))
@@ -189,6 +190,8 @@ def _beam(exposures: Exposures, unsaid: Unsaid) -> dict[str, str]:
     }
     rows = dict([beam_named(exposures.energy_kev)]) if "energy_kev" not in unsaid else {NAMES["energy_kev"]: UNKNOWN}
     rows |= {NAMES.get(name, name): UNKNOWN if name in unsaid else text for name, text in values.items()}
+    if exposures.views.sources is not None:
+        rows["source"] = f"{span(exposures.views.sources)} m before the object, whose rays are a cone"
     if exposures.psf_sigma_px.any():
         rows["blur"] = f"standard deviation {span(exposures.psf_sigma_px)} pixels"
     if exposures.bandwidth.any():

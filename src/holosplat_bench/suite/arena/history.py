@@ -11,6 +11,7 @@ from typing import Any
 
 from holosplat.checks import require
 from holosplat.io.json import read_json, write_json
+from holosplat.io.leftovers import RECORD
 from holosplat.metrics.images import json_number
 
 from ..folder import Row
@@ -101,8 +102,9 @@ def slug(text: str) -> str:
 
 
 def read_history(folder: Path) -> list[Entry]:
-    """The entries of a folder, the oldest first; none without a folder."""
-    return sorted((Entry.read(path) for path in sorted(folder.glob("*.json"))), key=lambda entry: entry.when)
+    """The entries of a folder, the oldest first; none without a folder. Beside entries lie records of provenance."""
+    entries = [path for path in sorted(folder.glob("*.json")) if not path.name.endswith(RECORD)]
+    return sorted((Entry.read(path) for path in entries), key=lambda entry: entry.when)
 
 
 @dataclass(frozen=True)
