@@ -59,7 +59,8 @@ def test_the_map_of_matter_is_exported_and_viewed(run, tmp_path, monkeypatch):
         assert file["matter"].dtype == np.float32
         assert file["matter"][()] == pytest.approx(likely.values, abs=1e-6)
         assert file["views"][()].max() == 3  # one is held out
-    objects, _ = view._objects(run)
+    objects, _, slider = view._objects(run)
+    assert slider == "shown"
     shown = [label for label in objects if label]
     assert shown == list(likely_surfaces(likely))
     assert shown

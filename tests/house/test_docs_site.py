@@ -143,10 +143,7 @@ def test_the_api_lists_every_public_module_once():
 
 def test_the_api_describes_the_top_level_names():
     index = site.api_pages()["api/index.md"]
-    assert (
-        "[`Views`][holosplat.geometry.Views]: The poses of V parallel-beam views, and the raster of their detectors."
-        in index
-    )
+    assert "[`Views`][holosplat.geometry.Views]: The poses of V views, and the raster of their detectors." in index
     assert "[holosplat.optics](optics.md)" in index
 
 

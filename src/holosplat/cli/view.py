@@ -99,7 +99,7 @@ def view(what: Positional[Path], port: Port = 8080) -> None:
 
     folder = RunFolder(what)
     followed = what.is_dir() and fitted_by(folder) is not None
-    objects, words = ({}, []) if followed else _objects(what)
+    objects, words, slider = ({}, [], "time") if followed else _objects(what)
     page = LiveView(what.resolve().name or "holosplat", port)
     try:
         if followed:
@@ -107,7 +107,6 @@ def view(what: Positional[Path], port: Port = 8080) -> None:
         else:
             from ..show.scene import Scene
 
-            slider = "time" if all(label.endswith("s") for label in objects) else "shown"
             Scene(page).put(objects, words, slider)
             say_where(page)
         _until_interrupted()
@@ -137,8 +136,9 @@ def _until_interrupted() -> None:
     threading.Event().wait()
 
 
-def _objects(what: Path) -> tuple[dict[str, Stored], list[str]]:
-    """What a slider leads through, by its label: times, or a rehearsed run and its likely matter; and words on it."""
+def _objects(what: Path) -> tuple[dict[str, Stored], list[str], str]:
+    """What a slider leads through, by its label: times, or a rehearsed run and its likely matter; words on it; and the
+    slider's name."""
     from ..io.compact import SERIES
     from ..io.hdf5 import open_hdf5
     from ..io.objects import read_object, read_series
@@ -154,14 +154,15 @@ def _objects(what: Path) -> tuple[dict[str, Stored], list[str]]:
         folder.require_run()
         obj, matter = folder.read_result(), matter_of(folder)
         likely = {} if matter is None else likely_surfaces(matter)
-        return at_times(obj, instants_of(folder)) | likely, [obj.described, *steps_of(folder)]
+        words, slider = [obj.described, *steps_of(folder)], "shown" if likely else "time"
+        return at_times(obj, instants_of(folder)) | likely, words, slider
     with open_hdf5(what) as file:
         several = file.attrs.get("format", "") == SERIES
     if several:
         series = read_series(what)
-        return series, [f"{len(series)} objects"]
+        return series, [f"{len(series)} objects"], "time"
     obj = read_object(what)
-    return at_times(obj, ()), [obj.described]
+    return at_times(obj, ()), [obj.described], "time"
 
 
 def compare(
