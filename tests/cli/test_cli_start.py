@@ -67,7 +67,7 @@ def test_the_overview_names_every_command():
 def test_every_public_function_of_a_command_module_is_a_command():
     """A new command that is not in the table would be unreachable."""
     modules = {inspect.getmodule(command(name)) for name in COMMANDS}
-    inner = {"report", "thesis", "write_bodies"}  # of `bench`; of `surface`
+    inner = {"report", "thesis", "arena", "write_bodies"}  # of `bench`; of `surface`
     inner |= {"status", "collect"}  # of `series`
     inner |= {"reconstruct_each", "reconstruct_in_motion", "asks_for_motion", "may_go_on", "report_of_middle"}
     inner |= {"watched", "say_where"}  # these and the others of `reconstruct`, by its --motion and --view
