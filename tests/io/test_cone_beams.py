@@ -129,6 +129,23 @@ def test_a_source_nearby_makes_a_cone_of_rays(tmp_path: Path):
     assert read(nikon(tmp_path / "run"), {"energy_kev": 20.0}).exposures.views.sources is None
 
 
+def test_sizes_at_the_sample_do_not_make_rays_parallel(tmp_path: Path):
+    """A file that says both what it measured at the sample and a source nearby, or a pixel size that is told."""
+    views = Views.evenly_spaced(2, shape=SHAPE, pixel_size=PIXEL)
+    write_scan(tmp_path / "s.nxs", Scan(np.ones((2, *SHAPE)), Exposures.of(views, 20.0, BEHIND), np.zeros(2)))
+    with h5py.File(tmp_path / "s.nxs", "a") as file:
+        file["entry/instrument/source/distance"] = -20 * max(SHAPE) * PIXEL
+        for axis in "xy":
+            file[f"entry/sample/{axis}_pixel_size"] = PIXEL
+        file["entry/sample/propagation_distance"] = BEHIND
+    for told in ({}, {"pixel_size": PIXEL, "distance": BEHIND}):
+        found = read(tmp_path / "s.nxs", told).exposures
+        assert found.views.sources == pytest.approx([20 * max(SHAPE) * PIXEL] * 2)
+        assert (found.views.pixel_size, found.distance[0]) == (PIXEL, BEHIND)
+    far = read(tmp_path / "s.nxs", {"source_distance": 30 * max(SHAPE) * PIXEL, "pixel_size": PIXEL, "distance": 0.0})
+    assert far.exposures.views.sources is None
+
+
 def test_cones_of_rays_are_written_and_read_back(tmp_path: Path):
     views = replace(Views.evenly_spaced(3, shape=SHAPE, pixel_size=PIXEL), sources=np.array([1e-3, 2e-3, 1e-3]))
     scan = Scan(np.ones((3, *SHAPE)), Exposures.of(views, 20.0, 0.01), np.zeros(3))

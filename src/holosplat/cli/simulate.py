@@ -171,9 +171,9 @@ def simulate(
     require(beamline.exposures is None or not source.cone, "--cone goes with --distance; leave it, or --exposures.")
     from_afar = not beamline.distances or source.source_distance is None
     require(from_afar, "--distances is of parallel light; leave --source-distance, which blurs each of them otherwise.")
-    of_source, given, beamline = source.facts(beamline), beamline, source.applied(beamline)
+    of_source, beamline = source.facts(beamline), source.applied(beamline)
     named = imaged.generated.in_medium(filling)
-    views, filled = source.rays(beamline.planned(), given), named.filling(beamline.medium_index)
+    views, filled = source.rays(beamline.planned()), named.filling(beamline.medium_index)
     true_views = experiment.misalignment.errors().true_exposures(views)
     with ProgressBar() as bar:
         times = imaged.generated.timing(motion) if imaged.generated.specimen else np.zeros(1)

@@ -102,18 +102,12 @@ class SourceOptions:
             raise InputError(NO_SPECTRUM)
         return polychromatic_frames(lambda energy: refilled(matter, filling, energy), light, exposures, how)
 
-    def rays(self, exposures: Exposures, beamline: BeamlineOptions) -> Exposures:
-        """The exposures with the rays of a cone that is wide; `beamline` as it was given."""
-        import numpy as np
+    def rays(self, exposures: Exposures) -> Exposures:
+        """The exposures with the rays of a cone that is wide."""
+        from ..io.raw_file import with_rays
 
-        from ..io.raw_file import magnified
-
-        if not self.cone or self.source_distance is None:
-            return exposures
-        told = (self.source_distance, beamline.distance, beamline.pixel_size, beamline.detector)
-        wide, views = magnified("--cone", *told).source, exposures.views
-        sources = None if wide is None else np.full(len(views), wide)
-        return replace(exposures, views=replace(views, sources=sources))
+        source = self.source_distance if self.cone else None
+        return replace(exposures, views=with_rays(exposures.views, source))
 
     def facts(self, beamline: BeamlineOptions) -> dict[str, str]:
         """What the scan file says of the source; `beamline` as it was given."""

@@ -12,7 +12,7 @@ from ..checks import InputError, note, require, warn
 from ..geometry import Views
 from ..units import ANGLE_UNITS, LENGTH_UNITS, format_length, unit_factor
 from .hdf5 import Fields, attribute_text
-from .raw_file import Magnified, magnified, said
+from .raw_file import magnified, said
 
 FLIPS = ("instrument/detector/y_flipped", "instrument/detector/x_flipped")
 SHIFT = "instrument/detector/shift"
@@ -116,27 +116,32 @@ def tell_moves(fields: Fields, per_frame: Callable[[str], np.ndarray], pixel: fl
             )
 
 
+def source_before(fields: Fields, given: Mapping[str, Any]) -> tuple[str, float | None]:
+    """How far [m] before the sample the source is, as it is given (`Told.source_distance`), or else as the file says,
+    and what messages call it; None where neither says it."""
+    if (told := given.get("source_distance")) is not None:
+        return "--source-distance", told
+    if (name := fields.find(*SOURCES)) is None:
+        return "", None
+    source = np.abs(fields.numbers(name).reshape(-1)) * fields.unit(name, LENGTH_UNITS, "m")
+    there = np.isfinite(source).all() and source.all() and len(source) > 0
+    return fields.label(name), float(source[0]) if there else None
+
+
 def magnification(
     fields: Fields, per_frame: Callable[[str], np.ndarray], detector: str, given: Mapping[str, Any]
-) -> Magnified:
+) -> np.ndarray | float:
     """(R + z) / R of a source R before the sample, and the detector z behind it, [n] or one number; both as they are
-    given (`Told.source_distance`), or else as the file says. Errors: `InputError` for a distance that cannot be.
+    given, or else as the file says. Errors: `InputError` for a distance that cannot be.
     """
-    name, told = fields.find(*SOURCES), given.get("source_distance")
-    if told is not None:
-        label, before = "--source-distance", told
-        behind = said(given, "distance")
-    else:
-        if name is None or not fields.find(detector):
-            return Magnified(1.0, None)
-        source = np.abs(fields.numbers(name).reshape(-1)) * fields.unit(name, LENGTH_UNITS, "m")
-        if not (np.isfinite(source).all() and source.any()):
-            return Magnified(1.0, None)
-        label, before, behind = fields.label(name), float(source[0]), None
+    (label, before), told = source_before(fields, given), given.get("source_distance") is not None
+    if before is None or not (told or fields.find(detector)):
+        return 1.0
+    behind = said(given, "distance") if told else None
     if behind is None:
         behind = np.abs(per_frame(fields.need(detector))) * fields.unit(detector, LENGTH_UNITS, "m")
     data, size = fields.find("instrument/detector/data", "data/data"), fields.find("instrument/detector/x_pixel_size")
-    pixel = said(given, "pixel_size") if told is not None else None
+    pixel = said(given, "pixel_size") if told else None
     if pixel is None and size is not None:
         pixel = float(fields.numbers(size).reshape(-1)[0]) * fields.unit(size, LENGTH_UNITS, "m")
     shape = fields.dataset(data).shape[1:] if data is not None and pixel is not None else (0, 0)

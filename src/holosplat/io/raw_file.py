@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -30,16 +30,6 @@ PARALLEL = 1.001
 """A smaller magnification is that of a parallel beam."""
 WIDEST = 0.02
 """Tangent of half the angle of a cone of rays, at most, that is taken for parallel at the object."""
-
-
-class Magnified(NamedTuple):
-    """by: magnification, a number or one for each frame; source: distance [m] of the source of a cone whose rays are
-    not taken for parallel, or None."""
-
-    by: float | np.ndarray
-    source: float | None
-
-
 RAW_TAKES = (*TAKES, "leave_out")
 """The same for files whose flats and darks are read frame by frame."""
 NOTHING: Mapping[str, Any] = {}
@@ -197,21 +187,22 @@ def stand_in(*names: str) -> dict[str, float]:
     return {name: STAND_INS[name] for name in names}
 
 
-def magnified(label: str, source: float, distance: float | np.ndarray, pixel: float, shape: Sequence[int]) -> Magnified:
+def magnified(
+    label: str, source: float, distance: float | np.ndarray, pixel: float, shape: Sequence[int]
+) -> float | np.ndarray:
     """Magnification (R + z) / R of a source R before the sample, of detectors z behind it; 1 for a parallel beam.
 
     label: what messages call the source; source, distance: R and z [m]; pixel: of the detector [m]; shape: of frames.
-    Distance and pixel over it are those of the parallel beam of the same waves (`optics.coherence`). Rays are parallel,
-    too, where the object is thin against R, which is taken for so up to `WIDEST`. Errors: `InputError` for a distance
-    that cannot be.
+    Distance and pixel over it are those of the parallel beam of the same waves (`optics.coherence`); for rays see
+    `with_rays`. Errors: `InputError` for a distance that cannot be.
     """
     before = in_range(label, source, 1e-6, FARTHEST_M, unit="metres")
     found = 1 + np.asarray(distance, dtype=np.float64) / before
     if found.max() < PARALLEL:
-        return Magnified(1.0, None)
+        return 1.0
     half = 0.5 * max(shape)
     tangent = half * pixel / (before * float(found.min()))
-    if wide := tangent > WIDEST:
+    if tangent > WIDEST:
         rays = f"rays are those of a cone, tangent of half its angle {tangent:.2g}"
     else:
         rays = (
@@ -222,7 +213,17 @@ def magnified(label: str, source: float, distance: float | np.ndarray, pixel: fl
         f"{label}: the source is {before:.4g} m before the sample; pixels and distance at the detector are divided by "
         f"the magnification of {float(found.max()):.4g}; {rays}"
     )
-    return Magnified(found if found.ndim else float(found), before if wide else None)
+    return found if found.ndim else float(found)
+
+
+def with_rays(views: Views, source: float | None) -> Views:
+    """The views, whose pixels are those at the sample, with the rays of a point source [m] before it (None: far away).
+
+    Up to a tangent of `WIDEST` of half the cone's angle they are taken for parallel.
+    """
+    if source is None or 0.5 * float(views.fields.max()) <= WIDEST * source:
+        return views
+    return replace(views, sources=np.full(len(views), source))
 
 
 def require_said(label: str, missing: Sequence[str]) -> None:
@@ -261,14 +262,13 @@ def exposures_of(
     told = {name: said({name: found.get(name) if given.get(name) is None else given[name]}, name) for name in RANGES}
     values = {name: value for name, value in told.items() if value is not None}
     require_said(label, [name for name in RANGES if name not in values])
-    told_source, cone = given.get("source_distance"), None
+    told_source = given.get("source_distance")
     if (source := found.get("source_distance") if told_source is None else told_source) is not None:
         own = {name for name in ("distance", "pixel_size") if told_source is not None or given.get(name) is None}
         behind, pixel = ((values if name in own else found).get(name, 0.0) for name in ("distance", "pixel_size"))
         where = f"{label}: the source" if told_source is None else "--source-distance"
         larger = magnified(where, source, behind, pixel, shape)
-        values |= {name: values[name] / float(larger.by) for name in own}
-        cone = larger.source
+        values |= {name: values[name] / float(larger) for name in own}
     angles = given["angles_deg"] if given.get("angles_deg") is not None else found.get("angles_deg")
     if angles is None and int(projections.sum()) == 1:
         angles = np.zeros(1)
@@ -284,8 +284,7 @@ def exposures_of(
         f"there must be one angle for each of the {count} {frames}, but there are {len(angles)}; correct --angles.",
     )
     turned = rotation_y(angles)
-    views = Views.from_rotations(turned, shape, values["pixel_size"])
-    views = views if cone is None else replace(views, sources=np.full(count, cone))
+    views = with_rays(Views.from_rotations(turned, shape, values["pixel_size"]), source)
     return Exposures.of(views, values["energy_kev"], values["distance"])
 
 

@@ -22,7 +22,7 @@ from ..units import ANGLE_UNITS, BEAM_RANGE_KEV, ENERGY_UNITS, LENGTH_UNITS, PLA
 from .angles import tell_steps
 from .hdf5 import Fields, attribute_text, open_hdf5
 from .light import read_divided_light
-from .nxtomo_geometry import CONE, SHIFT, about_axis, flips_of, magnification, tell_moves
+from .nxtomo_geometry import CONE, SHIFT, about_axis, flips_of, magnification, source_before, tell_moves
 from .nxtomo_geometry import FLIPS as FLIPS
 from .raw_file import (
     DARK,
@@ -30,12 +30,12 @@ from .raw_file import (
     INVALID,
     NOTHING,
     PROJECTION,
-    Magnified,
     ScanFile,
     angles_of_projections,
     require_said,
     said,
     stand_in,
+    with_rays,
 )
 
 DATA = "instrument/detector/data"
@@ -224,27 +224,25 @@ def _optional(
 
 
 def _views(fields: Fields, kinds: np.ndarray, given: Mapping[str, Any]) -> Views:
-    views, cone = _placed(fields, kinds, given)
-    if cone is not None:
-        return replace(views, sources=np.full(len(views), cone))
-    if not fields.find(CONE):
-        return views
-    return replace(views, sources=_per_frame(fields, kinds, CONE) * fields.unit(CONE, LENGTH_UNITS, "m"))
+    views = _placed(fields, kinds, given)
+    if fields.find(CONE) and given.get("source_distance") is None:
+        return replace(views, sources=_per_frame(fields, kinds, CONE) * fields.unit(CONE, LENGTH_UNITS, "m"))
+    return with_rays(views, source_before(fields, given)[1])
 
 
-def _placed(fields: Fields, kinds: np.ndarray, given: Mapping[str, Any]) -> tuple[Views, float | None]:
-    """The views with parallel rays, and the distance [m] of the source where they are not, and it magnifies."""
+def _placed(fields: Fields, kinds: np.ndarray, given: Mapping[str, Any]) -> Views:
+    """The views with parallel rays."""
     shape = fields.dataset(fields.need(*DATA_NAMES)).shape[1:]
     shifts = _optional(fields, kinds, SHIFT, LENGTH_UNITS, "m", (2,))
     larger = _magnification(fields, kinds, given, "pixel_size", PIXEL_SIZES[:2])
-    pixel_size = (said(given, "pixel_size") or _pixel_sizes(fields, kinds)) / larger.by
+    pixel_size = (said(given, "pixel_size") or _pixel_sizes(fields, kinds)) / larger
     tell_moves(fields, lambda name: _per_frame(fields, kinds, name), float(np.min(pixel_size)))
     if given.get("angles_deg") is not None or not fields.find(ROTATION):
         views = Views.of_pixels(_rotations_of_angles(fields, kinds, given), shifts, shape, pixel_size)
-        return views if fields.find(SHIFT) else about_axis(fields, views), larger.source
+        return views if fields.find(SHIFT) else about_axis(fields, views)
     rotations = _per_frame(fields, kinds, ROTATION, (3, 3))
     try:
-        return Views.of_pixels(rotations, shifts, shape, pixel_size), larger.source
+        return Views.of_pixels(rotations, shifts, shape, pixel_size)
     except InputError as error:
         raise InputError(f"{fields.label(ROTATION)}: {error}") from None
 
@@ -318,7 +316,7 @@ def _energies(fields: Fields, kinds: np.ndarray, given: Mapping[str, Any]) -> np
 
 def _distances(fields: Fields, kinds: np.ndarray, given: Mapping[str, Any]) -> np.ndarray:
     told = said(given, "distance")
-    larger = _magnification(fields, kinds, given, "distance", DISTANCES[:1]).by
+    larger = _magnification(fields, kinds, given, "distance", DISTANCES[:1])
     if told is not None:
         return np.full(int((kinds == PROJECTION).sum()), told) / larger
     distances = _distances_of_file(fields, kinds) / larger
@@ -334,14 +332,14 @@ def _distances_of_file(fields: Fields, kinds: np.ndarray) -> np.ndarray:
 
 def _magnification(
     fields: Fields, kinds: np.ndarray, given: Mapping[str, Any], quantity: str, effective: tuple[str, ...]
-) -> Magnified:
+) -> np.ndarray | float:
     """(R + z) / R of a source R before the sample, by which pixels and distance are divided; 1 for a parallel beam, and
     where the file has one of the `effective` names, or the quantity is said without the source."""
     told = said(given, quantity) is not None
     if told and given.get("source_distance") is None:
-        return Magnified(1.0, None)
+        return 1.0
     if not told and fields.find(*(name.format(axis) for name in effective for axis in "xy")):
-        return Magnified(1.0, None)
+        return 1.0
     return magnification(fields, lambda name: _per_frame(fields, kinds, name), DISTANCES[1], given)
 
 
