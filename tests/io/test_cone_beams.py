@@ -11,15 +11,19 @@ import pytest
 import tifffile
 
 import holosplat as hs
-from helpers.cli import holosplat
+from helpers.cli import holosplat, worked
 from holosplat.align.axis import find_axis
 from holosplat.checks import InputError
 from holosplat.geometry import Views
 from holosplat.io.formats import read, read_as
+from holosplat.io.images import write_tiff
+from holosplat.io.nerf_synthetic import write_nerf_synthetic
 from holosplat.io.nxtomo import write_scan
 from holosplat.io.reading import Reading, Told
+from holosplat.io.vtk import write_mesh
 from holosplat.optics.coherence import effective_geometry
 from holosplat.scan import Exposures, Scan
+from holosplat.specimens.red_cells import icosphere
 from holosplat.workflows.join import join
 
 SOURCE, BEHIND, PIXEL = 0.25, 0.75, 4e-6
@@ -161,6 +165,29 @@ def test_cones_of_rays_are_written_and_read_back(tmp_path: Path):
     assert np.array_equal(views.sources, [1e-3, 2e-3, 1e-3] * 2)
     with pytest.raises(InputError, match="must all have cones of rays or none, but 1 of 2 have them"):
         join([tmp_path / "cones.nxs", tmp_path / "parallel.nxs"], tmp_path / "both.nxs")
+
+
+@pytest.mark.parametrize("name", ["scan.tif", "scene"])
+def test_cones_of_rays_stand_in_tables(name, tmp_path: Path):
+    views = replace(Views.evenly_spaced(3, shape=SHAPE, pixel_size=PIXEL), sources=np.array([1e-3, 2e-3, 1e-3]))
+    scan = Scan(np.ones((3, *SHAPE), np.float32), Exposures.of(views, 20.0, 0.01), np.zeros(3, dtype=bool))
+    (write_tiff if name == "scan.tif" else write_nerf_synthetic)(tmp_path / name, scan)
+    assert np.array_equal(read(tmp_path / name).exposures.views.sources, views.sources)
+
+
+def test_a_simulated_cone_is_that_of_its_source(tmp_path: Path):
+    """A ball between source and axis is seen larger than on the axis, by R / (R + z)."""
+    vertices, faces = icosphere(2)
+    body = hs.mesh.TriangleMesh(1e-6 * (4 * vertices + np.array([0.0, 0.0, -50.0])), faces)
+    write_mesh(tmp_path / "ball.vtk", body, "um")
+    beam = ["--pixel-size", 2e-6, "--detector", 25, 31, "--angles-deg", 0, "--tilts-deg", 0, "--test-every", 0]
+    cone = ["--source-distance", 0.2e-3, "--distance", 0.2e-3, "--cone", "--origin", 0, 0, 0]
+    out = tmp_path / "cone.nxs"
+    worked(holosplat("simulate", tmp_path / "ball.vtk", "--material", "gold", *beam, *cone, "--out", out))
+    scan = read(out)
+    assert scan.exposures.views.sources.tolist() == [0.2e-3]
+    shadow = scan.frames[0] < 0.5 * (scan.frames[0].min() + 1)
+    assert 2 * np.sqrt(shadow.sum() / np.pi) == pytest.approx(8 * 200 / 150, rel=0.1)
 
 
 def test_what_needs_parallel_beams_refuses_cones(tmp_path: Path):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -59,3 +61,13 @@ def test_a_field_loses_a_first_fringe_at_each_side():
     width = fringes(Exposures.of(views, 20.0, 0.1))[0]
     np.testing.assert_array_equal(rows, np.abs(y) <= 10.5e-6 - width)
     assert 0 < rows.sum() < 21
+
+
+def test_in_cones_what_is_nearer_the_source_leaves_the_frame_sooner():
+    """On the beam's axis all depths are seen; half a field beside it, only what lies behind the axis."""
+    views = replace(Views.from_angles([0.0], (9, 11), 1e-6), sources=np.array([20e-6]))
+    grid = Grid((13, 3, 13), (1e-6,) * 3, (-6e-6, -1e-6, -6e-6))
+    seen = views_seeing(Exposures.of(views, 20.0, 0.0), grid)
+    z, y, x = np.meshgrid(*(np.arange(n) - (n - 1) / 2 for n in grid.shape), indexing="ij")
+    assert np.array_equal(seen > 0, (np.abs(x) * 20 / (20 + z) <= 5.5) & (np.abs(y) * 20 / (20 + z) <= 4.5))
+    assert seen[-1, 1, 0] > seen[0, 1, 0] == 0

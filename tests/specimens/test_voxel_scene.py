@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views, rotation_tilted
 from holosplat.matter import DeltaBeta
+from holosplat.mesh import TriangleMesh
 from holosplat.specimens.continuous import Bump, ContinuousScene, ellipsoid
-from holosplat.specimens.scene import VoxelScene
+from holosplat.specimens.red_cells import icosphere
+from holosplat.specimens.scene import MeshScene, VoxelScene
 from holosplat.volume import Volume
 
 MATTER = DeltaBeta(2e-7, 1e-10)
@@ -72,3 +76,19 @@ def test_the_field_that_a_volume_needs():
     assert scene.missing_field(Views.evenly_spaced(1, (25, 27), 1e-6)) == pytest.approx(1e-6)
     with pytest.raises(InputError, match="zero everywhere"):
         VoxelScene(Volume(0 * delta, 0 * delta, GRID))
+
+
+def test_scenes_in_cones_lie_where_the_rays_meet_them():
+    """A ball before the axis, beside the middle: its shadow, and how far it reaches beyond the frame."""
+    vertices, faces = icosphere(3)
+    mesh = TriangleMesh(1e-6 * (3 * vertices + np.array([3.0, -2.0, -6.0])), faces)
+    views = replace(Views.from_angles([0.0, 90.0], (25, 31), 1e-6), sources=np.array([30e-6, 40e-6]))
+    exact = MeshScene.of_one_material([mesh], DeltaBeta(1e-6, 1e-9))
+    lines = exact.project(views)[1].numpy()
+    voxels = VoxelScene(exact.voxelise(Grid.centred((25, 25, 25), 1e-6)))
+    assert np.linalg.norm(voxels.project(views)[1].numpy() - lines) < 0.1 * np.linalg.norm(lines)
+    x = 1e-6 * (np.arange(31) - 15)
+    assert (lines[0].sum(0) * x).sum() / lines[0].sum() == pytest.approx(3e-6 * 30 / 24, rel=0.05)
+    nearest = mesh.vertices[:, :2] / (1 + mesh.vertices[:, 2:] / 30e-6)
+    beyond = (np.abs(nearest) - 0.5e-6 * np.array([31, 25])).max()
+    assert exact.missing_field(views[[0]]) == pytest.approx(beyond, rel=1e-9)
