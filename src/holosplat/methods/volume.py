@@ -46,6 +46,7 @@ class SmoothVolume(Method):
     """
 
     kind: ClassVar[str] = "volume"
+    cones: ClassVar[bool] = True
     likelier: ClassVar[bool] = True
     two_sided: ClassVar[bool] = True
 

@@ -139,8 +139,7 @@ def _facts(path: Path, reading: Reading, loader: Loader, opened: Opened, unsaid:
     rows |= look.rows()
     if look.is_light and unsaid.keys().isdisjoint(OPTICS):
         rows["fringes"] = look.fringes(fringes(scan.exposures) / scan.views.pixel_sizes)
-    cones = scan.views.sources is not None  # which the default method refuses
-    if look.is_light and not unsaid and not cones:
+    if look.is_light and not unsaid:
         rows |= _needs(scan, numbers)
     missing = list(dict.fromkeys(unsaid.values()))
     if not look.is_light:
@@ -154,7 +153,7 @@ def _facts(path: Path, reading: Reading, loader: Loader, opened: Opened, unsaid:
         )
     words = ["holosplat reconstruct", shlex.quote(str(path)), *_options(reading)]
     words += [f"--{OPTIONS.get(name, name)} …" for name in unsaid]
-    more = " ".join([*words, *["--motion each"] * scan.is_series, *["--method tikhonov-tv"] * cones, "--out run"])
+    more = " ".join([*words, *["--motion each"] * scan.is_series, "--out run"])
     matter = "not in the file; --material NAME or --delta-beta RATIO says it, else δ/β is estimated"
     facts = Facts(rows | {"material": matter}, tuple(missing), (more,) if look.is_light else ())
     return ScanFacts(facts, scan, look, numbers, tuple(unsaid))
