@@ -344,7 +344,9 @@ def _shadow(element: Element, views: Views) -> tuple[np.ndarray, np.ndarray]:
     if views.sources is None:
         return corners[0, :, :2], corners[1, :, :2]
     depth = 1 + corners[:, :, 2:] / views.sources[:, None]
-    require(bool((depth > 0).all()), "the source must lie before the specimen, but it is beside or behind a part of it.")
+    require(
+        bool((depth > 0).all()), "the source must lie before the specimen, but it is beside or behind a part of it."
+    )
     seen = (corners[:, None, :, :2] / depth).reshape(4, -1, 2)
     return seen.min(0), seen.max(0)
 
