@@ -32,7 +32,7 @@ from holosplat.geometry import Grid
 from holosplat.learning.start import LearnedStart, guess_matter
 from holosplat.methods import Auto, Task
 from holosplat.methods.learned import NAME
-from holosplat.methods.sharp_level import material_of_levels
+from holosplat.methods.volume import material_of_levels
 from holosplat.metrics import volume_scores
 from holosplat.specimens.continuous import ContinuousScene
 from holosplat.specimens.scene import MeshScene

@@ -20,7 +20,7 @@ from rows import written
 
 from holosplat.baselines.material import estimate_delta
 from holosplat.methods import Task
-from holosplat.methods.sharp_level import material_of_levels
+from holosplat.methods.volume import material_of_levels
 
 SHARP = ("cells", "shells", "balls")
 COLUMNS = ("case", "seed", "views", "noise", "tomography", "likeliest", "commit", "machine")

@@ -21,7 +21,7 @@ from holosplat.baselines.material import estimate_delta
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.beamline.simulate import simulate
 from holosplat.geometry import Views
-from holosplat.learning.images import seen_in
+from holosplat.learning.start import seen_in
 from holosplat.materials import parse_material
 from holosplat.matter import MaterialPrior
 from holosplat.methods.method import Task, quiet

@@ -7,7 +7,7 @@ import torch
 
 from helpers.two_balls import ONE, PIXEL, scan, truth
 from holosplat.geometry import Grid
-from holosplat.learning.images import retrieved_thickness
+from holosplat.learning.start import retrieved_thickness
 from holosplat.training.sample import Sample
 
 

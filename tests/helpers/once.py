@@ -26,7 +26,7 @@ from holosplat.methods.contrast import BELOW, BOTH, Scoring, both_sides, decide_
 from holosplat.methods.first_volumes import FirstVolumes
 from holosplat.methods.illumination import decided
 from holosplat.methods.levels import decide_matter
-from holosplat.methods.sharp_level import material_of_levels
+from holosplat.methods.volume import material_of_levels
 from holosplat.optics.background import Light
 from holosplat.progress import Progress
 from holosplat.scan import Scan

@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from holosplat.learning.lattice import COPIES
+from holosplat.learning.network import COPIES
 from holosplat.training.sample import Sample
 from holosplat.training.shown import example_of_views, make_example
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from holosplat.geometry import Grid, Views, rotation_tilted
-from holosplat.learning.lattice import Taps
+from holosplat.learning.network import Taps
 
 SHAPES = [(16, 16), (13, 19)]
 

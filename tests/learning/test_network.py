@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from holosplat.geometry import Grid, Views
-from holosplat.learning.lattice import Taps
-from holosplat.learning.network import Guess, Size, _fine, coarse, thickness_of
+from holosplat.learning.network import Guess, Size, Taps, _fine, coarse, thickness_of
 
 SMALL = Size((4, 4, 6, 6), 3, (4, 6, 8))
 

@@ -9,8 +9,7 @@ from torch import Tensor, nn
 
 import holosplat as hs
 from holosplat.geometry import Views
-from holosplat.learning.lattice import Taps
-from holosplat.learning.network import FINE, THICKNESS
+from holosplat.learning.network import FINE, THICKNESS, Taps
 from holosplat.learning.start import GuessedMatter, guess_matter, spread
 from holosplat.specimens import Ball
 

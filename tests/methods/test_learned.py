@@ -12,7 +12,7 @@ from torch import Tensor, nn
 import holosplat as hs
 from holosplat.baselines import HolographicTV
 from holosplat.inference import Decision
-from holosplat.learning.lattice import Taps
+from holosplat.learning.network import Taps
 from holosplat.learning.start import GuessedMatter, LearnedStart
 from holosplat.learning.weights import Card, Trained
 from holosplat.methods import Gaussians, Surfaces, Task

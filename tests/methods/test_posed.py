@@ -13,7 +13,7 @@ from torch import Tensor, nn
 import holosplat as hs
 from holosplat.geometry import Grid
 from holosplat.inference import Decision, Score
-from holosplat.learning.lattice import Taps
+from holosplat.learning.network import Taps
 from holosplat.learning.start import Guessed, LearnedStart
 from holosplat.learning.weights import Card, Trained
 from holosplat.materials import HAEMOGLOBIN

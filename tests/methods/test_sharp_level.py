@@ -15,9 +15,10 @@ from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta, MaterialPrior, Matter
-from holosplat.methods import SmoothVolume, Task, sharp_level
+from holosplat.methods import SmoothVolume, Task
+from holosplat.methods import volume as sharp_level
 from holosplat.methods.method import first_of_task
-from holosplat.methods.sharp_level import material_of_levels
+from holosplat.methods.volume import material_of_levels
 from holosplat.representations import VoxelGrid
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens import MeshScene

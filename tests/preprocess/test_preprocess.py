@@ -18,9 +18,8 @@ from holosplat.preprocess import (
     significant,
     unlit,
 )
-from holosplat.preprocess.eigen_flats import _effective
+from holosplat.preprocess.eigen_flats import _binned, _effective
 from holosplat.preprocess.flat_field import mean_frame
-from holosplat.preprocess.weights import _binned
 
 H, W = 53, 70
 

@@ -23,9 +23,8 @@ from .coarse import Way, settled, unexplained
 from .gaussian_options import GaussianOptions
 from .keeper import BY
 from .method import Task
-from .sharp_level import material_of_levels
 from .surface_fit import SurfaceOptions, cut_surfaces, extract_surfaces, frames_of
-from .volume import SmoothStage, SmoothVolume
+from .volume import SmoothStage, SmoothVolume, material_of_levels
 
 
 def first_surfaces(

@@ -33,9 +33,9 @@ from .cross_validation import predicted_frames
 from .first_volumes import BY_FISSION, Folds
 from .gaussian_options import GaussianOptions
 from .method import Task, run_quietly
-from .sharp_level import material_of_levels
 from .start import cloud_of, starting_cloud
 from .surface_fit import SurfaceFit, SurfaceOptions, extract_surfaces, oversampling, surface_fit
+from .volume import material_of_levels
 
 POSES = "red cells by their shape"
 FIRST_STEPS, TRIAL_STEPS, LAST_STEPS = 400, 200, 120

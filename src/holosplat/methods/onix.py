@@ -23,7 +23,7 @@ from ..fit.schedule import Schedule
 from ..fit.terms import Objective
 from ..fit.terms.field import AlignedFrames, AlignedLines
 from ..geometry import Grid
-from ..learning.images import images, seen_in
+from ..learning.start import images, seen_in
 from ..learning.weights import ONIX, PIXELNERF, read_aligned
 from ..matter import DeltaBeta, Matter
 from ..ranges import Natural, Rate, Share, Weight, ranged

@@ -26,7 +26,7 @@ from ..optics.noise_model import NoiseModel
 from ..optics.sampling import fringe_sampling
 from ..representations import VoxelGrid
 from ..scan import Scan
-from .known_levels import KnownLevels
+from .assumed import KnownLevels
 from .modulation import modulated, unshrunk
 
 EXPLAINED, WEAKER = 0.95, 0.98

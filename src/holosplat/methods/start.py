@@ -36,7 +36,7 @@ from ..representations.initialise import cloud_of_moments, moments
 from ..scan import Scan
 from .gaussian_options import GaussianOptions
 from .method import Task
-from .sharp_level import material_of_levels
+from .volume import material_of_levels
 
 Retrieve = Callable[[Scan], tuple[Tensor, Grid]]
 """Occupancy [Z, Y, X] and its grid, by a scan."""

@@ -1,9 +1,8 @@
 """From raw counts to relative intensities: dark and flat fields, defective pixels, flat fields that change."""
 
-from .eigen_flats import EigenFlats, eigen_flats, significant
+from .eigen_flats import EigenFlats, TotalVariationWeights, eigen_flats, significant
 from .flat_field import relative_intensity, unlit
 from .pixels import PixelRepair, defective_pixels, fixed_pattern
-from .weights import TotalVariationWeights
 
 __all__ = [
     "EigenFlats",

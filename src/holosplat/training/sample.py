@@ -16,7 +16,7 @@ from ..beamline.light import UnevenLight
 from ..beamline.misalignment import Misalignment
 from ..checks import InputError
 from ..geometry import Grid, Views
-from ..learning.images import retrieved_thickness
+from ..learning.start import retrieved_thickness
 from ..matter import DeltaBeta
 from ..optics.noise import noise_levels
 from ..scan import Exposures, Scan

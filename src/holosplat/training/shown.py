@@ -14,10 +14,8 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 
 from ..geometry import Grid, Views
 from ..io.atomic import write_rows
-from ..learning.images import images
-from ..learning.lattice import Taps
-from ..learning.network import FINE, Guess
-from ..learning.start import unexplained
+from ..learning.network import FINE, Guess, Taps
+from ..learning.start import images, unexplained
 from ..learning.weights import Card
 from .options import LossWeights, ViewSampling
 from .ranges import Ranges
