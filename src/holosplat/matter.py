@@ -10,7 +10,7 @@ import numpy as np
 
 from .checks import InputError, require
 from .geometry import Grid
-from .ranges import Signed, Within, ranged
+from .ranges import Signed, Within, checked_dataclass
 from .volume import Volume
 
 Sign = Literal[-1, 0, 1]
@@ -318,8 +318,7 @@ class KnownSeveral(MaterialPrior):
         return super().as_dict() | {"others": [list(other) for other in self.materials[1:]]}
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class KnownRatio(MaterialPrior):
     """One material of which only δ/β is known, and perhaps the sign of δ."""
 

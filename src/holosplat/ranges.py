@@ -11,10 +11,10 @@ import math
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cache, wraps
 from numbers import Integral, Real
-from typing import Annotated, Any, ParamSpec, TypeVar, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, ParamSpec, TypeVar, dataclass_transform, get_args, get_origin, get_type_hints
 
 from .checks import InputError, require
 
@@ -100,7 +100,8 @@ Returned = TypeVar("Returned")
 
 def ranged(kind: type[Kind]) -> type[Kind]:
     """Let the dataclass that is made of `kind` check its numbers and texts when it is made (`InputError`), beside what
-    its own `__post_init__` asks for, which knows better what to say. It stands below `@dataclass`."""
+    its own `__post_init__` asks for, which knows better what to say. It stands below `@dataclass`, where that has other
+    options than those of `checked_dataclass`."""
     own: Callable[[Any], None] | None = getattr(kind, "__post_init__", None)
 
     def checked(self: Any) -> None:
@@ -119,6 +120,12 @@ def ranged(kind: type[Kind]) -> type[Kind]:
     _ranged.add(kind)
     setattr(kind, "__post_init__", checked)  # noqa: B010  # only a class of its own is known to have it
     return kind
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(field,))
+def checked_dataclass(kind: type[Kind]) -> type[Kind]:
+    """Make of `kind` a frozen dataclass that is `ranged`."""
+    return dataclass(frozen=True)(ranged(kind))
 
 
 def with_checked_numbers(function: Callable[Given, Returned]) -> Callable[Given, Returned]:

@@ -61,7 +61,9 @@ NEEDED |= {kind.__name__: {"size": 4e-5} for kind in (*MATTER.values(), *CHANGIN
 OF_DECLARATIONS = (declaration, specimens, specimens)
 
 
-CLASS = re.compile(r"^((?:@.*\n)*@dataclass.*\n(?:@.*\n)*)class (\w+).*\n((?:(?:    .*)?\n)*)", re.MULTILINE)
+MARKS = r"^((?:@.*\n)*@(?:checked_)?dataclass.*\n(?:@.*\n)*)"
+CLASS = re.compile(MARKS + r"class (\w+).*\n((?:(?:    .*)?\n)*)", re.MULTILINE)
+RANGED = re.compile("@ranged|@checked_dataclass")
 FIELD = re.compile(r"^    \w+: (.*?)(?: = (.*))?$", re.MULTILINE)
 PLAIN = re.compile(r"(?<!\w)(?:float|int)(?!\w)")
 
@@ -74,8 +76,9 @@ def classes() -> dict[str, tuple[str, bool, bool]]:
         module = "holosplat." + ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
         for marks, name, body in CLASS.findall(path.read_text(encoding="utf-8")):
             fields = [field for field in FIELD.findall(body) if "ClassVar" not in field[0]]
-            if "@ranged" in marks or any(PLAIN.search(hint) for hint, _ in fields):
-                found[f"{module}.{name}"] = (module, all(default for _, default in fields), "@ranged" in marks)
+            is_ranged = RANGED.search(marks) is not None
+            if is_ranged or any(PLAIN.search(hint) for hint, _ in fields):
+                found[f"{module}.{name}"] = (module, all(default for _, default in fields), is_ranged)
     return found
 
 
@@ -163,3 +166,24 @@ def _stub(field: str, hint: Any, default: Any) -> Any:
     stub.__signature__ = inspect.Signature([inspect.Parameter(field, kind, default=default)])  # pyright: ignore
     stub.__annotations__ = {field: hint}
     return stub
+
+
+def defaults_of(module: Any) -> list[Any]:
+    """Defaults of all arguments and fields in a module that an object of ours is."""
+    found = list[Any]()
+    for one in vars(module).values():
+        for each in [one, *vars(one).values()] if inspect.isclass(one) else [one]:
+            function = getattr(each, "__func__", each)
+            if inspect.isfunction(function):
+                found += [*(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).values()]
+        if dataclasses.is_dataclass(one):
+            found += [field.default for field in dataclasses.fields(one)]
+    return [one for one in found if type(one).__module__.startswith("holosplat")]
+
+
+def test_defaults_that_are_objects_are_immutable():
+    """They are made once, and shared by all calls and objects."""
+    modules = {importlib.import_module(module) for module, _, _ in classes().values()}
+    kinds = {type(one) for module in modules for one in defaults_of(module) if not isinstance(one, tuple)}
+    assert len(kinds) > 50
+    assert {one.__name__ for one in kinds if not one.__dataclass_params__.frozen} == set()

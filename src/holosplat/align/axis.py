@@ -13,7 +13,7 @@ from ..geometry import Views, rotation_y
 from ..inference import Compared, Decision
 from ..optics.background import LightOptions
 from ..progress import Advance
-from ..ranges import ranged
+from ..ranges import checked_dataclass
 from ..scan import Exposures, Scan
 from .consistency import (
     Consistency,
@@ -40,8 +40,7 @@ FEWEST_VIEWS = 6
 """Fewer views than this leave nothing to judge an axis by."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class AxisOptions:
     """How the axis of a turning object is looked for."""
 

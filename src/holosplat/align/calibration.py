@@ -17,7 +17,7 @@ from ..optics.background import LightOptions
 from ..optics.retrieval import Tikhonov, paganin, tikhonov
 from ..optics.sampling import fringe_sampling
 from ..progress import Progress
-from ..ranges import Pixels, ranged
+from ..ranges import Pixels, checked_dataclass
 from ..scan import Exposures, Scan
 from .changes import changes, header, line, moved_onto
 from .derivatives import NUMBERS
@@ -43,8 +43,7 @@ NAMES = {"shift": "shifts", "angle": "turns across the beam", "roll": "roll", "d
 """The kinds of numbers in words."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class CalibrationOptions:
     """How a calibration proceeds."""
 

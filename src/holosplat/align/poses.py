@@ -20,7 +20,7 @@ from ..optics.retrieval import Tikhonov, tikhonov
 from ..optics.sampling import fringe_sampling
 from ..progress import Advance
 from ..projectors.voxels import LatticeProjector
-from ..ranges import Angle, Pixels, Weight, ranged
+from ..ranges import Angle, Pixels, Weight, checked_dataclass
 from ..scan import Exposures, Scan
 from .derivatives import NUMBERS, in_pixels, predicted
 from .initial_geometry import shifts_by_mass
@@ -30,8 +30,7 @@ SHIFT, TURN, DISTANCE, MAGNIFICATION, FLUX = slice(0, 2), slice(2, 5), 5, 6, 7
 """Places of the numbers of `NUMBERS`."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class PosePrior:
     """Standard deviations of what is not known of each view; 0: it is as planned."""
 
@@ -74,8 +73,7 @@ class PosePrior:
         return PoseRefinement(self.shift, float(angle), float(roll), self.distance, so_far, self.magnification)
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Drift:
     """Standard deviations of how far each beam of a series goes from the first time to the last; 0: it stays."""
 
@@ -110,8 +108,7 @@ class Level:
     rounds: int
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class PoseOptions:
     """How poses are looked for."""
 

@@ -13,15 +13,14 @@ from ..geometry import Grid, Views
 from ..memory import memory_kept
 from ..progress import Advance
 from ..projectors.voxels import Projector, SliceProjector
-from ..ranges import ranged
+from ..ranges import checked_dataclass
 from .rays import Rays, bounded, checked_upper, rays_of
 
 SHORTEST = 1e-3
 """Paths and shadows [pixels] below which a ray or a voxel counts as unseen; it then moves nothing."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Algebraic:
     """Options. sweeps: how often each ray is used (a few: errors of the lines are fitted later than the object);
     relaxation: length of a step, between 0 and 2; nonnegative: whether the occupancy is kept from going below zero.

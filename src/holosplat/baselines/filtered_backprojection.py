@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -13,13 +12,12 @@ from ..checks import require
 from ..geometry import Grid, Views
 from ..progress import Advance
 from ..projectors.voxels import projector_for
-from ..ranges import ranged
+from ..ranges import checked_dataclass
 from .algebraic import Algebraic, sirt
 from .rays import bounded, checked_upper, in_pixels
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Ramp:
     """Options. window: of the ramp filter; cutoff: its end, as a fraction of the Nyquist frequency; nonnegative:
     whether values below zero are set to zero at the end, which is no longer linear.

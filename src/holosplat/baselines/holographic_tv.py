@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import torch
@@ -31,7 +31,7 @@ from ..optics.retrieval.spectra import Raster, filtered, radian, response, spect
 from ..optics.sampling import fringe_sampling
 from ..progress import Progress
 from ..projectors.voxels import projector_for
-from ..ranges import Metres, Weight, ranged
+from ..ranges import Metres, Weight, checked_dataclass
 from ..scan import Scan
 from .beyond import Margins, carried_on, columns_beyond, rows_beyond, unseen_rays
 from .primal_dual import PrimalDual
@@ -51,8 +51,7 @@ def _always(volume: Tensor, grid: Grid) -> bool:
     return True
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class HolographicTV:
     """Options of the start: phase retrieval, total variation, and agreement with the holograms."""
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -14,7 +12,7 @@ from ..geometry import Grid
 from ..memory import memory_kept
 from ..optics.retrieval import paganin
 from ..progress import Progress
-from ..ranges import Weight, ranged
+from ..ranges import Weight, checked_dataclass
 from ..scan import Scan
 from .rays import rays_of
 from .tomography import TotalVariation, plateau, tv_solver
@@ -23,8 +21,7 @@ TRIAL_DELTA = 1e-6
 """The retrieved D = δT does not depend on it, but what a weight of total variation means does."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class MaterialEstimate:
     """How a material that is not known is estimated from the frames."""
 

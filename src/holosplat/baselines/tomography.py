@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -15,7 +15,7 @@ from ..memory import memory_kept
 from ..metrics.correlation import shortest_side
 from ..optics.patterns import smooth_modes
 from ..progress import Advance
-from ..ranges import Metres, Share, Weight, ranged
+from ..ranges import Metres, Share, Weight, checked_dataclass
 from .algebraic import Algebraic, art, sirt
 from .filtered_backprojection import filtered_backprojection
 from .primal_dual import PrimalDual
@@ -65,8 +65,7 @@ def sirt_nonnegative(
     return sirt(lines, views, grid, upper, on_progress, options=options, missing=missing, two_sided=two_sided)
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class TotalVariation:
     """Options. weight: of total variation, in pixels of path length; first: iterations with all frequencies of the
     lines trusted alike; iterations: those after, with each trusted by its misfit; discount: how much, as the power of

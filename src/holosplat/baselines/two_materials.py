@@ -27,7 +27,7 @@ from ..matter import LEAST_CONTRAST, DeltaBeta
 from ..model import Instrument
 from ..optics.sampling import fringe_sampling
 from ..projectors.voxels import voxel_line_integrals
-from ..ranges import Pixels, Share, Weight, ranged
+from ..ranges import Pixels, Share, Weight, checked_dataclass
 from ..representations.voxels import VoxelLines
 from ..scan import Scan
 from ..units import wavelength
@@ -38,8 +38,7 @@ STEP, ITERATIONS = 1e-10, 5
 """Of the linearisation in β."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class TwoMaterials:
     """How two materials are told apart."""
 

@@ -20,7 +20,7 @@ from ..io.pvd import TimeStep, write_pvd
 from ..io.vtk import write_mesh
 from ..mesh import TriangleMesh
 from ..progress import Advance
-from ..ranges import Seconds, Seed, Small, ranged
+from ..ranges import Seconds, Seed, Small, checked_dataclass
 from ..specimens.flow.channel import Channel
 from ..specimens.flow.suspension import Medium, State, Stepper, Suspension
 from ..specimens.membrane.model import Elasticity, Membrane
@@ -40,8 +40,7 @@ FIRST_STEP = 0.01
 MOST_CELLS, MOST_SNAPSHOTS = 1000, 100_000
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Growth:
     """Which cells, in which flow, recorded when."""
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from ..checks import at_least, require
-from ..ranges import Pixels, Seed, Signed, ranged
+from ..ranges import Pixels, Seed, Signed, checked_dataclass
 
 MOST_RMS = 0.2
 """Largest relative deviation of light (rms): beyond, one in a million pixels would have to be dark."""
@@ -21,8 +21,7 @@ FAINTEST = 0.01
 """No pixel gets less than this share of the light."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class UnevenLight:
     """How light differs from the flat field; by default not at all. Errors: `InputError` for values out of range."""
 

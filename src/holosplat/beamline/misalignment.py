@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from ..checks import require, require_regular
 from ..io.guard import read_array
-from ..ranges import Angle, Many, Pixels, Seed, Signed, ranged
+from ..ranges import Angle, Many, Pixels, Seed, Signed, checked_dataclass
 from ..scan import Exposures
 
 if TYPE_CHECKING:
@@ -20,8 +20,7 @@ if TYPE_CHECKING:
 MOST_SHIFT_PX, MOST_ROTATION_DEG, MOST_DISTANCE, MOST_MAGNIFICATION = 1000.0, 45.0, 0.1, 0.1
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Misalignment:
     """Standard deviations of the errors of each view, all independent and normally distributed.
 
@@ -86,8 +85,7 @@ GEOMETRIES: dict[Geometry, tuple[float, ...]] = {
 """Angles [degrees] about y: the thesis' sixteen views, and beams split by crystals (X-ray multi-projection imaging)."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Directions:
     """The views of an experiment: exactly one of `views`, `angles_deg`, `rotations` and `geometry`."""
 

@@ -21,15 +21,14 @@ from ..optics.illumination import Illumination, PulseModel, Pulses
 from ..optics.noise import PHOTON_RANGE
 from ..optics.resampling import FLIPS, Flip
 from ..progress import Advance
-from ..ranges import Many, Photons, Seed, ranged
+from ..ranges import Many, Photons, Seed, checked_dataclass
 from ..scan import Exposures, Scan
 
 DEAD_BIT, HOT_BIT = 1 << 1, 1 << 3
 """Bits of NeXus' `pixel_mask`: dead, over-responding."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class RecordingOptions:
     """Options of a recording."""
 

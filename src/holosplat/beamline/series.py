@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Literal
 
@@ -12,7 +12,7 @@ import numpy as np
 from ..checks import in_range, require
 from ..io.pvd import find_snapshots
 from ..progress import Advance
-from ..ranges import Frequency, Seconds, Signed, Weight, ranged
+from ..ranges import Frequency, Seconds, Signed, Weight, checked_dataclass
 from ..specimens.mesh_series import ROUNDING, MeshSeries
 from ..units import LENGTH_UNITS, unit_factor
 from .simulate import Filling, Shutter, field_centre, filled_scene
@@ -21,8 +21,7 @@ FRAME_RATE_RANGE = (1e-6, 1e12)
 MOST_TIMES = 1_000_000
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Timing:
     """Times of the frames of a series.
 
@@ -66,8 +65,7 @@ class Timing:
         return start + np.arange(count) / self.frame_rate
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class SeriesFiles:
     """How files of snapshots are read."""
 

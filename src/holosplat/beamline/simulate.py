@@ -23,7 +23,7 @@ from ..optics.detector import poisson
 from ..optics.noise import PHOTON_RANGE
 from ..optics.sampling import resolving_oversample
 from ..progress import Advance
-from ..ranges import Many, Photons, Seed, ranged
+from ..ranges import Many, Photons, Seed, checked_dataclass
 from ..scan import Exposures, Scan, interleaved_split
 from ..specimens.mesh_series import MeshSeries
 from ..specimens.repair import closed
@@ -39,8 +39,7 @@ most of them to half of that (docs/data/propagation.csv); faces exactly along th
 MOST_PULSES = 10_000
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Shutter:
     """Length of an exposure and its flashes, each shorter than any motion.
 
@@ -72,8 +71,7 @@ class Shutter:
         return ((np.arange(self.pulses) + 0.5) / self.pulses - 0.5) * self.exposure
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Simulation:
     """How frames are simulated.
 

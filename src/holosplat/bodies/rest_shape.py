@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from ..geometry import Grid, Views
 from ..io.vtk import read_meshes
 from ..matter import Matter
 from ..mesh import TriangleMesh
-from ..ranges import Metres, Weight, ranged
+from ..ranges import Metres, Weight, checked_dataclass
 from ..representations import SurfaceMesh, isosurface
 from ..specimens.membrane.resting import FREQUENCIES, resting_cell
 from ..specimens.repair import closed
@@ -29,8 +29,7 @@ COARSE, FEWEST, MOST = 180, 180, 3000
 """Triangles in the search, and in the fit at least and at most: there one has the area of a pixel."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class KnownBody:
     """The known shape that all bodies share."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,7 +10,7 @@ from tyro.conf import Positional
 
 from ..checks import require
 from ..io.reading import Part, Reading
-from ..ranges import Small, ranged
+from ..ranges import Small, checked_dataclass
 from .light import Degrees, LightFlags, Pixels, Share
 from .options import MaterialOptions, PriorOptions
 from .places import Output
@@ -30,8 +30,7 @@ if TYPE_CHECKING:
 TOML = ".toml"
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class PoseFlags:
     """How far off the plan each view may be: standard deviations. 0 keeps it as planned."""
 
@@ -51,8 +50,7 @@ class PoseFlags:
         return PosePrior(self.uncertain_shift, self.uncertain_angle, self.uncertain_roll, self.uncertain_distance)
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class MagnifiedFlags(PoseFlags):
     """The same, and the magnification."""
 
@@ -64,8 +62,7 @@ class MagnifiedFlags(PoseFlags):
         return replace(super().prior(), magnification=self.uncertain_magnification)
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class UncertainOptions(MagnifiedFlags):
     """How far off the plan each view may be: standard deviations. 0 keeps it as planned."""
 
@@ -81,8 +78,7 @@ class UncertainOptions(MagnifiedFlags):
         return PoseOptions(self.prior(), drift=Drift(self.drift_shift, self.drift_angle))
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class RefineOptions(MagnifiedFlags):
     """Beams that may be elsewhere than the scan says."""
 
@@ -233,8 +229,7 @@ def _ratio(prior: MaterialPrior) -> float | None:
     return None
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class BodyOptions:
     """The known shape: a mesh, or beads."""
 
@@ -259,8 +254,7 @@ class BodyOptions:
         return closed(read_meshes(self.phantom, self.length_unit)[0], self.length_unit)
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class DoubtOptions(PoseFlags):
     """How far off the plan each view may be: standard deviations. 0 keeps it as planned."""
 

@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 
 from ..checks import InputError, require
 from ..io.reading import Reading
-from ..ranges import Seed, Weight, ranged
+from ..ranges import Seed, Weight, checked_dataclass
 from .align import AS_SAID, RefineOptions
 from .light import RunLightFlags
 from .options import BeamlineOptions, MethodOptions, PriorOptions
@@ -32,8 +32,7 @@ if TYPE_CHECKING:
     from ..workflows.run_folder import RunFolder
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class CarriedFlags:
     """How matter changes between the times of a scan."""
 

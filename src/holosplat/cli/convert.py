@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,7 +20,7 @@ from ..io.reading import Reading
 from ..matter import KnownRatio, MaterialPrior
 from ..methods.method import STAND_IN_RATIO, shows_no_refraction
 from ..optics import retrieve_thickness
-from ..ranges import Metres, Natural, Positive, ranged
+from ..ranges import Metres, Natural, Positive, checked_dataclass
 from ..scan import Scan
 from ..workflows.run_illumination import FixedPatternOptions, flatfield_corrected
 from .options import PriorOptions
@@ -29,8 +29,7 @@ from .progress import ProgressBar
 from .sentence import say
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class WritingOptions:
     """How it is written."""
 
@@ -53,8 +52,7 @@ class WritingOptions:
         return said
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class EveningOptions:
     """Light that is the same in all frames."""
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -12,7 +11,7 @@ import numpy as np
 from tyro.conf import Positional
 
 from ..checks import InputError, as_written, in_range, require
-from ..ranges import Pixels, ranged
+from ..ranges import Pixels, checked_dataclass
 from .places import Output
 from .sentence import say
 
@@ -32,8 +31,7 @@ SERIES = {".h5": ".xdmf", ".hdf5": ".xdmf", ".vti": ".pvd", VTU: ".pvd"}
 """Suffixes of files of single times, and that of the file beside them which opens all of them in ParaView."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class ObjectFiles:
     """The object of a run as it is, not its volume."""
 

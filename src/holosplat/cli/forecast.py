@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -19,7 +19,7 @@ from ..motion.forecast import PathForecast
 from ..motion.learned import GraphForecast
 from ..motion.modes import DmdForecast, SindyForecast
 from ..planning.acts import of_forecast
-from ..ranges import Many, Positive, Seconds, Seed, Signed, Small, ranged
+from ..ranges import Many, Positive, Seconds, Seed, Signed, Small, checked_dataclass
 from ..report.run import report_run
 from ..scan import Scan
 from ..specimens.flow.suspension import PLASMA_VISCOSITY
@@ -48,8 +48,7 @@ from .room import tell
 from .sentence import interruptible, put, say
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class ForecastFlags:
     """How bodies move on."""
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.constructors import PrimitiveConstructorSpec
 
 from ..checks import InputError
-from ..ranges import ranged
+from ..ranges import checked_dataclass
 
 if TYPE_CHECKING:
     from ..optics.background import LightOptions
@@ -25,8 +25,7 @@ DECISIONS: dict[str, dict[str, str]] = {
 """What can be told of the light and the noise, and the field of `LightOptions` that holds it."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class LightFlags:
     """The light beside the flat fields."""
 
@@ -42,8 +41,7 @@ class LightFlags:
         return LightOptions(self.light, self.air)
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class RunLightFlags(LightFlags):
     """The light beside the flat fields, of several frames."""
 

@@ -29,6 +29,7 @@ from ..ranges import (
     Small,
     Weight,
     Within,
+    checked_dataclass,
     ranged,
 )
 
@@ -43,8 +44,7 @@ if TYPE_CHECKING:
     from ..scan import Exposures
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class MeshOptions:
     """How mesh files are read."""
 
@@ -71,8 +71,7 @@ class MeshOptions:
         require(not stray, f"--{stray[0].replace('_', '-') if stray else ''} goes with --frame-rate, of a series.")
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class MaterialOptions:
     """What fills the meshes."""
 
@@ -192,8 +191,7 @@ class BeamlineOptions(Directions):
         return interleaved_split(count, self.test_every)
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class NoiseOptions:
     """Photon noise."""
 
@@ -209,8 +207,7 @@ class NoiseOptions:
         return Simulation(self.photons_per_pixel, self.seed, shutter=shutter, light=light)
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class MotionOptions:
     """Moving meshes: a time-resolved scan, all views of a time taken at the same instant."""
 
@@ -244,8 +241,7 @@ class MotionOptions:
         return None
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class MisalignmentOptions:
     """Errors of each view that the scan file does not know of; --true-exposures keeps them."""
 
@@ -272,8 +268,7 @@ class MisalignmentOptions:
         return {name: f"{value:g}" for name, value in vars(self).items()}
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class MethodOptions:
     """How the reconstruction proceeds."""
 
@@ -322,8 +317,7 @@ class MethodOptions:
         return method
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class PriorOptions:
     """What is known of the matter; without any of these, one material or two are found, with their δ and β."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,7 +15,7 @@ from ..planning.contrast import Setup
 from ..planning.plan import Motion, Plan, Recording, Sampling, Storage, Survey, Waves, experiment
 from ..planning.plan import plan as make_plan
 from ..progress import Advance
-from ..ranges import Grams, Many, Metres, Positive, Signed, Small, ranged
+from ..ranges import Grams, Many, Metres, Positive, Signed, Small, checked_dataclass
 from ..units import in_percent
 from .options import MaterialOptions
 from .places import Output
@@ -34,8 +34,7 @@ SIZE_RANGE_M = (1e-8, 1e-1)
 MOST_POINTS = 20_000
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class ObjectOptions:
     """The one object to be seen."""
 
@@ -100,8 +99,7 @@ class ObjectOptions:
         return f"{shape}{turned}, {self.material} {around}"
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class RangeOptions:
     """Where the best distance and energy lie."""
 

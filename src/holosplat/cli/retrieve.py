@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -14,7 +13,7 @@ from ..io.atomic import atomic_path
 from ..io.phase_maps import PhaseMaps, is_file, write_phase_maps
 from ..io.reading import Reading
 from ..matter import DeltaBeta, KnownRatio
-from ..ranges import Grams, Signed, ranged
+from ..ranges import Grams, Signed, checked_dataclass
 from .light import LightFlags
 from .options import PriorOptions
 from .places import Output
@@ -32,8 +31,7 @@ STAND_IN_DELTA = 1e-6
 RetrievalName = Literal["tikhonov", "admm", "ctf", "paganin", "gerchberg-saxton", "hybrid-input-output"]
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class OneMaterial:
     """The one material; give it, or δ/β."""
 

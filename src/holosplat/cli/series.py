@@ -14,7 +14,7 @@ from ..checks import require
 from ..io.formats import read_frames
 from ..io.reading import Reading
 from ..matter import MaterialPrior
-from ..ranges import Jobs, Seed, ranged
+from ..ranges import Jobs, Seed, checked_dataclass
 from ..series.collect import collect as join
 from ..series.folder import Row, SeriesFolder, line_of, some, table_of, time_left, verdict_of
 from ..series.plan import Cut, Settings, Slurm, Warm, listed, plan_series
@@ -36,8 +36,7 @@ UNFINISHED = 4
 """Exit code of `series run` and `collect` where tasks failed or are left."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class EachTime:
     """What is done with each time."""
 
@@ -76,8 +75,7 @@ def _changed(*groups: object) -> list[str]:
     return [name for group, usual in pairs for name, value in vars(group).items() if value != getattr(usual, name)]
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class SlurmFlags(Slurm):
     """A Slurm array script, FOLDER/slurm.sh, of the tasks that are left, --block of them in each job."""
 

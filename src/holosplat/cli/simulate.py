@@ -12,7 +12,7 @@ from tyro.conf import Positional
 
 from ..beamline.light import EVEN_LIGHT, UnevenLight
 from ..checks import InputError, require
-from ..ranges import ranged
+from ..ranges import checked_dataclass
 from .options import (
     BeamlineOptions,
     MaterialOptions,
@@ -45,8 +45,7 @@ if TYPE_CHECKING:
     Still = MeshScene | ContinuousScene | VoxelScene | CarriedScene | RodScene | ChangingScene
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class TruthOptions:
     """What is also written, for judging."""
 

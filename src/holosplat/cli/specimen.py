@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 from tyro.conf import UseAppendAction, arg
 
 from ..checks import InputError, require
-from ..ranges import Grams, Many, Metres, Positive, Seed, Signed, Small, SomeShare, ranged
+from ..ranges import Grams, Many, Metres, Positive, Seed, Signed, Small, SomeShare, checked_dataclass
 from .options import BeamlineOptions, MaterialOptions, MeshOptions, MotionOptions
 
 if TYPE_CHECKING:
@@ -37,8 +37,7 @@ NO_SPECTRUM = (
 )
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class SourceOptions:
     """What the light comes from; without any of these, a plane wave of one energy."""
 
@@ -143,8 +142,7 @@ USUAL_COUNT = 9
 """Cells or droplets unless --specimen-count says otherwise."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class VolumeOptions:
     """What the images of a TIFF stack show; files of `export --volume` say it themselves."""
 
@@ -177,8 +175,7 @@ class VolumeOptions:
         return VoxelScene(read_specimen(paths, StackMeaning(self.voxel_size, of, self.stacked)))
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class GeneratedOptions:
     """Matter that is generated, in place of files."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,7 @@ from ..motion.known import beam_directions
 from ..motion.track import TrackOptions
 from ..optics.background import LightOptions
 from ..planning.acts import of_motion, of_track
-from ..ranges import Metres, Seed, Share, Weight, ranged
+from ..ranges import Metres, Seed, Share, Weight, checked_dataclass
 from ..report.run import report_run
 from ..scan import Scan
 from ..workflows.evaluate import evaluate as score
@@ -35,8 +35,7 @@ from .room import tell_frames
 from .sentence import interruptible, put, say
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class BodyFlags:
     """What is known of the bodies' shape."""
 
@@ -58,8 +57,7 @@ class BodyFlags:
         return KnownBody(self.body, self.body_unit, self.body_size, self.body_uncertain, self.body_stiffness)
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class MotionFlags:
     """How bodies are found and move."""
 

@@ -16,7 +16,7 @@ from tyro.conf import Positional
 from ..checks import as_written, require
 from ..io.reading import Reading, Told
 from ..progress import FitProgress, FitState
-from ..ranges import Many, Within, ranged
+from ..ranges import Many, Within, checked_dataclass
 from .places import Output
 from .sentence import put, say
 
@@ -30,8 +30,7 @@ Port = Annotated[int, Within(1024, 65535)]
 """Ports that anybody may listen on."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class LiveFlags:
     """The live view of a fit (extra view)."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -11,15 +10,14 @@ from torch import Tensor
 
 from ..geometry import Views
 from ..model import Model
-from ..ranges import Natural, Share, ranged
+from ..ranges import Natural, Share, checked_dataclass
 from ..representations.gaussians import GaussianCloud, unit_quaternions
 from .optimiser import Leaves, Trainable
 
 CENTRES = "object.centres"
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class DensityControl:
     """Options of densification and pruning."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import torch
@@ -11,7 +10,7 @@ from torch import Tensor
 
 from ..checks import require
 from ..model import Model
-from ..ranges import ranged
+from ..ranges import checked_dataclass
 from . import adam
 from .problem import Problem
 
@@ -55,8 +54,7 @@ class Optimiser(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Group:
     """How Adam moves one parameter where that differs from its default.
 

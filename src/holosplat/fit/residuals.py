@@ -12,7 +12,7 @@ from torch import Tensor
 from ..checks import finite, require
 from ..memory import memory_kept
 from ..model import Alignment, Instrument, LightField, Model, smooth_modes
-from ..ranges import Weight, ranged
+from ..ranges import Weight, checked_dataclass
 from ..scan import Exposures, Scan
 from ..volume import LineIntegrals, Object
 from .terms import comparisons
@@ -125,8 +125,7 @@ class Residuals:
     probes: tuple[Probe, ...]
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Allowance:
     """What a residual may have beside noise, for no model is exact."""
 

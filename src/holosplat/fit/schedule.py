@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from ..checks import at_least, require
-from ..ranges import ranged
+from ..ranges import checked_dataclass
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Schedule:
     """Options of the optimisation loop; the rates themselves belong to the method."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Protocol
 
 import torch
@@ -15,7 +15,7 @@ from ..backends import device, resolve
 from ..checks import require
 from ..geometry import Grid
 from ..projectors.voxels import projector_for
-from ..ranges import Weight, ranged
+from ..ranges import Weight, checked_dataclass
 from .quasi_newton import direction
 from .whitened import WhitenedFrames
 
@@ -30,8 +30,7 @@ MATTER = 0.05
 """Share of the largest value above which a voxel counts as matter for the preconditioner."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class ContinuousPrior:
     """The prior of matter: `a Σ log(1 + (√(|∇u|² + ε²) - ε) / b) + m Σ log(1 + d(u) / v)`.
 

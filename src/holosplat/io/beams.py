@@ -11,7 +11,7 @@ import numpy as np
 
 from ..checks import InputError, require, shaped
 from ..geometry import Views, rotation_tilted
-from ..ranges import Metres, Signed, Small, ranged
+from ..ranges import Metres, Signed, Small, checked_dataclass
 from ..scan import Exposures, Scan
 from ..tables import from_table, read_table
 from .atomic import atomic_path
@@ -25,8 +25,7 @@ Pair = tuple[Signed, Signed]
 Triple = tuple[Signed, Signed, Signed]
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class ViewErrors:
     """Standard errors of what was found of a view."""
 
@@ -40,8 +39,7 @@ class ViewErrors:
     """Magnification, as a share of it."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class BeamView:
     """One view of the file, an entry `[[view]]`; what is left out stays as the scan says."""
 

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ..checks import InputError, in_range
-from ..ranges import ranged
+from ..ranges import checked_dataclass
 from ..representations import GaussianCloud, Stored
 
 FORMAT = "holosplat compact 1"
@@ -29,8 +29,7 @@ LEVELS = 2000
 """Steps in the range of voxel values."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Steps:
     """The steps of what is stored.
 

@@ -20,7 +20,7 @@ from ..frames import Frames
 from ..geometry import Grid
 from ..matter import DeltaBeta
 from ..progress import Advance
-from ..ranges import Small, ranged
+from ..ranges import Small, checked_dataclass
 from ..scan import Scan
 from ..volume import Object, Volume
 from . import arrays, euxfel, images, nerf_synthetic, nxtomo, r2_gaussian
@@ -284,8 +284,7 @@ def read_volume_file(path: Path, delta_told: bool = True) -> Volume:
     return volume_format(path).read(path).volume(path, delta_told)
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class StackMeaning:
     """What a stack of TIFF images shows.
 

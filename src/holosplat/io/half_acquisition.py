@@ -16,7 +16,7 @@ from ..checks import note, require, warn
 from ..frames import Derived, Frames, Taken
 from ..geometry import Views
 from ..preprocess.pixels import filled
-from ..ranges import ranged
+from ..ranges import checked_dataclass
 from ..scan import Scan
 from ..tables import number_in, shown
 from .angles import angles_of, is_half_acquisition
@@ -138,8 +138,7 @@ def stitched(scan: Scan) -> Scan:
     return Scan.of(frames, replace(exposures, views=wide), held_out, scan.provenance | {"stitched": "opposite frames"})
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Tube:
     """A round tube about the rotation axis. inner, outer: diameters [m]; attenuation: µ of its wall [1/m]."""
 

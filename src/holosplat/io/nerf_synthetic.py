@@ -17,7 +17,7 @@ from PIL import Image
 
 from ..checks import InputError, UnsaidError, at_least, in_range, require
 from ..geometry import Views
-from ..ranges import Metres, Positive, Signed, Small, ranged
+from ..ranges import Metres, Positive, Signed, Small, checked_dataclass
 from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, Scan, checked_distance
 from .atomic import atomic_folder
 from .guard import undamaged
@@ -68,8 +68,7 @@ MOST_TANGENT = 0.02
 from the axis may a point stray, per half field of view of depth."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class NerfOptions:
     """Options of the folder."""
 
@@ -85,8 +84,7 @@ class NerfOptions:
         at_least(self, 1, "seed_points")
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class GivenOptics:
     """Values that folders of other programs lack."""
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..checks import InputError, UnsaidError, at_least, finite, in_range, positive, require, shaped
 from ..geometry import Grid, Views
-from ..ranges import ranged
+from ..ranges import checked_dataclass
 from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, Scan
 from ..units import wavenumber
 from ..volume import Volume
@@ -36,8 +36,7 @@ SEED_DENSITY = 0.15
 """Density of the points to start from, of a material of 1: they overlap (the default of its own script)."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class R2Options:
     """Options of the folder."""
 

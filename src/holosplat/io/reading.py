@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from ..checks import InputError, require
-from ..ranges import Frequency, Index, Natural, Positive, Signed, Small, ranged
+from ..ranges import Frequency, Index, Natural, Positive, Signed, Small, checked_dataclass
 from ..tables import LARGEST, from_table, number_in, shown, to_table
 from ..units import photon_energy
 from .angles import read_angles, tell_angles, tell_views
@@ -31,8 +31,7 @@ OWN_WAY = (
 """Fields of `Told` that no loader takes by their own name."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Told:
     """What is said of a scan beside its files; it goes before what they say themselves."""
 
@@ -210,8 +209,7 @@ class Told:
         return beams
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Part:
     """Which part of a scan is taken."""
 

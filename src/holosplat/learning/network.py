@@ -20,7 +20,7 @@ from torch.nn.functional import avg_pool2d, avg_pool3d, interpolate
 
 from ..checks import at_least, require
 from ..geometry import Grid, Views
-from ..ranges import Natural, ranged
+from ..ranges import Natural, checked_dataclass
 
 
 @dataclass(frozen=True)
@@ -147,8 +147,7 @@ MOST_LEVELS = 10
 """Levels of a U-Net, at most: the coarsest of eleven is of one pixel where the finest has a thousand."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Size:
     """How large a network is; about a million weights by default."""
 

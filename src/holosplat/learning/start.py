@@ -20,7 +20,7 @@ from ..optics.noise import noise_levels
 from ..optics.retrieval import FIXED, Tikhonov, tikhonov
 from ..optics.sampling import fringe_sampling
 from ..progress import Progress
-from ..ranges import Natural, ranged
+from ..ranges import Natural, checked_dataclass
 from ..scan import Exposures, Scan
 from ..volume import Volume
 from .network import COPIES, FINE, THICKNESS, Guess, Taps, coarse, thickness_of
@@ -79,8 +79,7 @@ FEWEST_VIEWS = 3
 """Views of which one can be left out to see what the others say."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class LearnedStart:
     """Options of a start that a network guesses."""
 

@@ -9,7 +9,7 @@ frames start on their own pixels.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -18,7 +18,7 @@ from torch.nn.functional import avg_pool2d
 from ..checks import at_least
 from ..matter import DeltaBeta
 from ..optics.noise import noise_levels
-from ..ranges import Pixels, Positive, Share, Weight, ranged
+from ..ranges import Pixels, Positive, Share, Weight, checked_dataclass
 from ..representations import GaussianCloud, SurfaceMesh
 from ..representations.isosurface import edge_lengths, loop_subdivision
 from ..scan import Scan
@@ -33,8 +33,7 @@ DOUBT = 0.2
 """Part of the noise's power that its estimate may be wrong by: what is less in the frames is not seen."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class CoarseToFine:
     """How large frames of closed bodies start."""
 

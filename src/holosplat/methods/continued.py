@@ -12,7 +12,7 @@ from ..checks import InputError, require
 from ..fit.loop import Fit
 from ..inference import Compared, Score
 from ..io.objects import read_object
-from ..ranges import Natural, Positive, ranged
+from ..ranges import Natural, Positive, checked_dataclass
 from ..representations import GaussianCloud, Stored, SurfaceMesh, VoxelGrid
 from .auto import Auto
 from .cross_validation import predicted_frames
@@ -24,8 +24,7 @@ from .surfaces import Surfaces, SurfaceStage
 from .volume import SmoothStage, SmoothVolume
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Effort:
     """How long a fit that goes on takes: matter has moved by a pixel or less, and is else as it was."""
 

@@ -15,13 +15,12 @@ from ..fit.density import DensityControl
 from ..fit.schedule import Schedule
 from ..fit.terms import Objective
 from ..learning.start import LearnedStart
-from ..ranges import Pixels, Rate, Share, Weight, ranged
+from ..ranges import Pixels, Rate, Share, Weight, checked_dataclass
 from .coarse import CoarseToFine
 from .ground import ExtraTerm
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class GaussianRates:
     """Adam's rates of the parameters at the start of a fit."""
 
@@ -58,8 +57,7 @@ class FitOptions:
     """What computes the fit."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class GaussianOptions:
     """Options of Gaussians: their start, and their fit."""
 

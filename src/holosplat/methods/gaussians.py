@@ -22,7 +22,7 @@ from ..geometry import Grid
 from ..matter import Matter
 from ..optics.background import Light
 from ..optics.noise import noise_share
-from ..ranges import ranged
+from ..ranges import checked_dataclass
 from ..representations import GaussianCloud, Stored, SurfaceMesh
 from ..scan import Scan
 from .coarse import STAGE as COARSE
@@ -36,8 +36,7 @@ from .start import cloud_of_surfaces, starting_cloud
 from .surface_fit import SurfaceFit, SurfaceOptions, field_of, oversampling
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Gaussians(GaussianOptions, Method):
     """The method that fits Gaussians to the frames; they start from phase retrieval and tomography, or at random.
 

@@ -16,13 +16,12 @@ from ..matter import Matter
 from ..model import Instrument, Model, SolvedLight
 from ..optics.background import Light
 from ..optics.sampling import fringe_sampling
-from ..ranges import ranged
+from ..ranges import checked_dataclass
 from ..scan import Scan
 from ..volume import Object
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class ExtraTerm:
     """A term of `fit.terms.TERMS` beside those of the objective."""
 

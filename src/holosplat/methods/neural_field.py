@@ -25,7 +25,7 @@ from ..geometry import Grid, Poses, Views
 from ..matter import Matter
 from ..model import Model
 from ..optics.background import Light
-from ..ranges import Rate, Weight, ranged
+from ..ranges import Rate, Weight, checked_dataclass
 from ..representations import NeuralField, Stored, VoxelGrid
 from ..representations.neural_field import Network, grown
 from ..scan import Scan
@@ -42,8 +42,7 @@ SECOND_STAGE = 1_000_003
 """Added to the seed for the stage through the waves."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class NeuralFit:
     """Options of a neural field and its fit."""
 

@@ -26,7 +26,7 @@ from ..geometry import Grid
 from ..learning.start import images, seen_in
 from ..learning.weights import ONIX, PIXELNERF, read_aligned
 from ..matter import DeltaBeta, Matter
-from ..ranges import Natural, Rate, Share, Weight, ranged
+from ..ranges import Natural, Rate, Share, Weight, checked_dataclass
 from ..representations import AlignedNetwork, PixelAligned, PixelAlignedField, Stored
 from ..representations.neural_field import grown
 from ..scan import Scan
@@ -37,8 +37,7 @@ from .neural_field import visual_hull
 from .volume import binning
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class AlignedFit:
     """Options of a pixel-aligned field and its fit."""
 

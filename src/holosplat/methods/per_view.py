@@ -19,14 +19,13 @@ from ..matter import Matter
 from ..optics.retrieval import RETRIEVALS
 from ..progress import Advance
 from ..projectors.voxels import rows_match
-from ..ranges import Positive, Signed, ranged
+from ..ranges import Positive, Signed, checked_dataclass
 from ..representations import Stored, VoxelGrid
 from .assumed import assumed_material
 from .method import Method, Stage, Task
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Mbir:
     """Options of `svmbir.recon`. snr_db: signal to noise assumed of the lines [dB]; sharpness: higher is sharper; p, T:
     shape and threshold of the qGGMRF prior (p near 1 keeps edges); iterations: all are done, for its own rule may stop

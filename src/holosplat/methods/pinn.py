@@ -18,7 +18,7 @@ from ..fit.schedule import Schedule
 from ..fit.terms import Objective
 from ..fit.terms.equations import Equations, EquationTerm, SpaceTimeVariation
 from ..matter import Matter
-from ..ranges import Rate, Weight, ranged
+from ..ranges import Rate, Weight, checked_dataclass
 from ..representations import SpaceTime, SpaceTimeField, Stored
 from ..representations.space_time import FLOW
 from .assumed import assumed_material
@@ -34,8 +34,7 @@ SECOND_STAGE = 1_000_003
 """Added to the seed for the stage through the waves."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class PinnFit:
     """Options of a space-time field and its fit."""
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import cast
 
 import numpy as np
@@ -31,7 +31,7 @@ from ..memory import memory_kept
 from ..optics.coherence import joined_blur_px
 from ..optics.noise_model import NoiseModel
 from ..optics.sampling import fringe_sampling
-from ..ranges import Share, ranged
+from ..ranges import Share, checked_dataclass
 from ..representations import VoxelGrid
 from ..scan import Scan
 from .method import Task, quiet
@@ -55,8 +55,7 @@ Constants = Mapping[str, float]
 """Values of what is uncertain, by the names of `Uncertain`."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class ProfileOptions:
     """How the likelihood of constants is computed."""
 

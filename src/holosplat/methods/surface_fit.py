@@ -29,7 +29,7 @@ from ..matter import Matter
 from ..optics.background import Light
 from ..optics.noise import noise_share
 from ..optics.sampling import fringe_sampling
-from ..ranges import Rate, Weight, ranged
+from ..ranges import Rate, Weight, checked_dataclass
 from ..representations import GaussianCloud, SurfaceMesh, isosurface
 from ..representations.isosurface import adjacency, edge_lengths, neighbour_mean
 from ..scan import Scan
@@ -43,8 +43,7 @@ NEAR = 2
 """Voxels within which a material is near: that far a pixel's blur reaches."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Extraction:
     """How surfaces are cut out of the occupancy that Gaussians add up to."""
 
@@ -62,8 +61,7 @@ class Extraction:
         in_range("spacing", self.spacing, 0.25, 8.0, unit="pixels")
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class SurfaceFit:
     """Options of the fit of surfaces to frames."""
 

@@ -12,7 +12,7 @@ import numpy as np
 from ..baselines.material import MaterialEstimate, estimate_ratio
 from ..checks import InputError, require
 from ..matter import DeltaBeta, Known, KnownRatio, KnownSeveral, MaterialPrior
-from ..ranges import ranged
+from ..ranges import checked_dataclass
 from ..scan import Scan
 from .method import Task, shows_no_refraction
 from .profile import Profile, ProfileOptions, exposed
@@ -50,8 +50,7 @@ WIDTHS = ("bandwidth", "source_angle", "psf_sigma_px")
 """Constants that may be 0, which holds unless the frames predict each other better with the likeliest value."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Uncertain:
     """Lowest and highest values of what is not known better; None for what is."""
 

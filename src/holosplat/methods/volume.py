@@ -18,7 +18,7 @@ from ..fit.smooth_volume import ContinuousPrior
 from ..geometry import Grid
 from ..matter import DeltaBeta, KnownRatio, Matter
 from ..optics.retrieval.spectra import contrast_level
-from ..ranges import Weight, ranged
+from ..ranges import Weight, checked_dataclass
 from ..representations import Stored, VoxelGrid
 from ..scan import Scan
 from .assumed import assumed_material
@@ -36,8 +36,7 @@ def _start() -> HolographicTV:
     return HolographicTV(noisy=1.0, refine=1, upper=0.0)
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class SmoothVolume(Method):
     """Continuous matter on voxels: any value from zero up, no levels, no bound, as likely as frames and noise make it.
 

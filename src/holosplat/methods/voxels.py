@@ -22,7 +22,7 @@ from ..geometry import Grid
 from ..matter import Matter
 from ..optics.background import Light
 from ..optics.sampling import fringe_sampling
-from ..ranges import Weight, ranged
+from ..ranges import Weight, checked_dataclass
 from ..representations import Stored, VoxelGrid
 from ..scan import Scan
 from .assumed import assumed_material
@@ -68,8 +68,7 @@ class HolographicStage:
         """Nothing is fitted."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class VoxelFit:
     """Options of voxels fitted through the waves."""
 

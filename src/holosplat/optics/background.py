@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..checks import InputError, require
 from ..divided_light import DividedLight
-from ..ranges import ranged
+from ..ranges import checked_dataclass
 from .air import Box, air_in_boxes, find_air, has_air
 from .noise_model import NoiseModel
 from .patterns import cosines, half_waves, posterior, smooth_modes, sums
@@ -45,8 +45,7 @@ Still = Literal["auto", "none"]
 Noise = Literal["auto", "white", "correlated"]
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class LightOptions:
     """Assumptions about the light beyond the flat fields."""
 

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.fft import dctn, idctn
 
 from ..checks import in_range, positive, require
-from ..ranges import Pixels, Positive, Weight, ranged
+from ..ranges import Pixels, Positive, Weight, checked_dataclass
 
 BITS = (10, 16)
 FLAT_LEVEL = 0.4
@@ -21,8 +21,7 @@ GAINS = 1e-6, 1e6
 """Counts that a photon may give."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Camera:
     """A camera: photons in, whole numbers of counts out."""
 

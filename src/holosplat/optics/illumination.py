@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..checks import positive, require
-from ..ranges import Pixels, Positive, Weight, ranged
+from ..ranges import Pixels, Positive, Weight, checked_dataclass
 from .camera import spread
 
 FAINTEST = 0.02
@@ -21,8 +21,7 @@ COARSEST = 8.0
 """Grains of the coarsest component, in grains of the finest."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Illumination:
     """How the light of pulses varies, within a frame and from pulse to pulse."""
 

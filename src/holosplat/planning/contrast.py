@@ -17,7 +17,7 @@ from ..checks import finite, in_range, require
 from ..geometry import Views
 from ..matter import DeltaBeta
 from ..mesh import TriangleMesh
-from ..ranges import Metres, Pixels, Positive, Small, ranged
+from ..ranges import Metres, Pixels, Positive, Small, checked_dataclass
 from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, checked_distance
 from ..units import wavelength, wavenumber
 
@@ -81,8 +81,7 @@ class Subject:
         return added
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Setup:
     """The beam and the detector of one frame."""
 

@@ -12,7 +12,7 @@ import numpy as np
 from ..checks import in_range, positive, require
 from ..geometry import Grid, Views
 from ..progress import Advance
-from ..ranges import Frequency, Natural, Photons, Seconds, ranged
+from ..ranges import Frequency, Natural, Photons, Seconds, checked_dataclass
 from ..scan import Exposures
 from .contrast import Setup, Subject, Visibility, visibility
 
@@ -27,8 +27,7 @@ BYTES_A_VOXEL = 8
 """δ and β in single precision, as volume files hold them."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Recording:
     """The frames and views that are recorded."""
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -19,7 +18,7 @@ from torch.func import functional_call
 from torch.nn.functional import embedding_bag, grid_sample, interpolate, leaky_relu
 
 from ..checks import at_least, require
-from ..ranges import Natural, ranged
+from ..ranges import Natural, checked_dataclass
 
 MOST_LEVELS = 10
 """Levels of the encoder, at most: the coarsest of eleven is of one pixel where the finest has a thousand."""
@@ -33,8 +32,7 @@ FIRST_LOGIT = -2.0
 """Output of an untrained network everywhere, before its bound; low, so that a fit raises it."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class AlignedNetwork:
     """How large a pixel-aligned network is."""
 

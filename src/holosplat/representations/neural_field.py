@@ -20,7 +20,7 @@ from ..checks import at_least, require
 from ..display import of_object
 from ..geometry import Grid, Poses, Views
 from ..matter import Matter
-from ..ranges import ranged
+from ..ranges import checked_dataclass
 from ..tables import from_table, to_table
 from ..volume import LineIntegrals, Volume
 from .perceptron import Encoding
@@ -34,8 +34,7 @@ FIRST_VALUE = 0.05
 """What a field starts from, roughly, everywhere."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Network:
     """Options of the network: the encoding, and `layers` hidden layers of `hidden` units (ReLU) behind it."""
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal, NamedTuple
 
@@ -19,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn.functional import embedding_bag, grid_sample
 
 from ..checks import at_least, require
-from ..ranges import Weight, ranged
+from ..ranges import Weight, checked_dataclass
 
 OUTPUTS = 4
 """Three of the velocity, or of its potential, and the pressure."""
@@ -69,8 +68,7 @@ class Taylor(NamedTuple):
         return Taylor(h, first, second, third)
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class VelocityNetwork:
     """Options of the velocity."""
 
@@ -135,8 +133,7 @@ FIRST_FEATURES = 1e-4
 """Features start uniformly below this size, as Müller et al. (2022) have them."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Encoding:
     """Options of an encoding.
 

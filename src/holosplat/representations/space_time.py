@@ -17,7 +17,7 @@ from ..checks import positive, require
 from ..display import of_object
 from ..geometry import Grid, Poses, Views
 from ..matter import Matter
-from ..ranges import Pixels, ranged
+from ..ranges import Pixels, checked_dataclass
 from ..tables import from_table, to_table
 from ..volume import LineIntegrals, Volume
 from .flow import Lattice
@@ -31,8 +31,7 @@ EMPTIEST = 0.01
 """Distance of an occupancy from its bounds, as a share of them, that a start may have: beyond it nothing pulls."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class SpaceTime:
     """Options of the field."""
 

@@ -7,7 +7,6 @@ last; a `Drawn` is spread over seconds by `Drawn.over`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import ClassVar
 
@@ -19,7 +18,7 @@ from scipy.special import iv, logsumexp
 from ..checks import require
 from ..matter import DeltaBeta
 from ..mesh import TriangleMesh
-from ..ranges import Positive, Share, Small, SomeShare, ranged
+from ..ranges import Positive, Share, Small, SomeShare, checked_dataclass
 from .continuous import random_direction, random_rotation
 from .drawn import LONG, SHARE, ChangingScene, Drawn, Substances, lathe, meshed, region
 from .fluids import FASTEST
@@ -32,8 +31,7 @@ ROWS = 193
 """Circles of a body of revolution."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class MergingDrops:
     """Two drops that approach, touch, and flow together into one ball, their volume and their centre kept.
 
@@ -129,8 +127,7 @@ def bubble_radius(gas: float, mach: float, until: float, least: float = 1e-3) ->
     return found.sol
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Collapse:
     """A bubble in a liquid jet along the rotation axis that collapses, pierced by a jet of its own from one side.
 
@@ -205,8 +202,7 @@ def growth_rate(wave_number: float) -> float:
     return float(np.sqrt(max(k * (1 - k * k) * iv(1, k) / iv(0, k), 0.0)))
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class PinchingJet:
     """A jet along the rotation axis that Rayleigh and Plateau's disturbance breaks into drops, its volume kept.
 
@@ -265,8 +261,7 @@ class PinchingJet:
         return [drop.transformed(grown * np.eye(3), np.array([0, first + n * wave, 0])) for n in range(-4, 5)]
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class CrushedLattice(Lattice):
     """A lattice that is crushed along the rotation axis, most in a band in its middle, which bulges; struts keep their
     volume."""

@@ -18,7 +18,7 @@ import torch
 from ..checks import finite, in_range, require, shaped
 from ..geometry import Grid, Views
 from ..matter import DeltaBeta
-from ..ranges import ranged
+from ..ranges import checked_dataclass
 from ..volume import LineIntegrals, Volume
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(16)
@@ -58,8 +58,7 @@ class Profile(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Soft:
     """One inside, zero outside, and half a period of a cosine between: from `1 - width / 2` to `1 + width / 2`."""
 
@@ -103,8 +102,7 @@ class Soft:
         return total
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Bump:
     """`(1 - s²)^power` inside, which is smooth at its edge to the order `power - 1`."""
 

@@ -6,14 +6,13 @@ Lengths named `size` are in metres; all others are shares of it. Matter is said 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
 from ..checks import InputError, require
 from ..mesh import TriangleMesh
-from ..ranges import Many, ManyOrNone, Share, Small, SomeShare, ranged
+from ..ranges import Many, ManyOrNone, Share, Small, SomeShare, checked_dataclass
 from .continuous import NODES, WEIGHTS, ContinuousScene, Soft, ellipsoid
 from .drawn import LONG, SHARE, Drawn, Substances, ball_meshes, column, lathe, meshed, region
 from .phantoms import Ball
@@ -23,8 +22,7 @@ PIECES = 8
 """Pieces of a ray that are integrated one by one: with a tail of a twentieth, right to 1e-6 of the largest integral."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Blast:
     """Friedlander's wave, `(1 - x) exp(-x)` with `x = (1 - s) / tail`, behind a front at `s = 1`.
 
@@ -90,8 +88,7 @@ TRIES = 10_000
 """Random places that are tried for one thread of a spray."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Bubbles:
     """Gas bubbles in a medium that fills the field and goes on beyond it."""
 
@@ -117,8 +114,7 @@ class Bubbles:
         return Drawn(scene, f"{self.count} bubbles, seed {seed}", {"bubbles": RodScene(scene.rods, SHARE)})
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Cuvette:
     """A square tube about the rotation axis, which goes on above and below: its wall, a liquid, bubbles in that.
 
@@ -151,8 +147,7 @@ class Cuvette:
         return Drawn(scene, f"a cuvette with {self.count} bubbles, seed {seed}", parts)
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Jet:
     """A liquid jet along the rotation axis, which swells and narrows as Rayleigh's disturbance makes it, with bubbles.
 
@@ -191,8 +186,7 @@ class Jet:
         return Drawn(scene, f"a jet with {self.count} bubbles, seed {seed}", parts)
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class BreakUp:
     """Threads of liquid along the rotation axis that broke up into drops, satellites and ligaments.
 
@@ -272,8 +266,7 @@ class BreakUp:
                 groups["satellites"].append(small.mesh(4, "satellite"))
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Shock:
     """A decaying spherical shock in a medium that fills the field: a jump, compression, rarefaction, and its bubble.
 

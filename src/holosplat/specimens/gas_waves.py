@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from ..checks import require
-from ..ranges import Positive, Share, Small, SomeShare, ranged
+from ..ranges import Positive, Share, Small, SomeShare, checked_dataclass
 from .continuous import ContinuousScene, Soft, ellipsoid, random_direction
 from .drawn import SHARE, ChangingScene, Drawn, Substances
 
@@ -106,8 +106,7 @@ WATER = Fluid(4.4, 1 / 4.4)
 """In units of the medium's density and speed of sound."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class ExpandingShock:
     """A spherical shock in a medium that fills the field, from a core that is suddenly hot, as by a laser's focus.
 

@@ -5,13 +5,12 @@ Lengths named `size` are in metres; all others are shares of it. Matter is said 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
 from ..checks import require
-from ..ranges import Many, ManyOrNone, Share, Small, SomeShare, ranged
+from ..ranges import Many, ManyOrNone, Share, Small, SomeShare, checked_dataclass
 from .drawn import (
     LONG,
     SHARE,
@@ -35,8 +34,7 @@ MODES = 60
 """Waves whose sum is a rough surface."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Crack:
     """A penny-shaped crack with rough faces in a block that is larger than the field."""
 
@@ -73,8 +71,7 @@ class Crack:
         return np.column_stack([number * np.cos(angle), number * np.sin(angle), phase, height])
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Keyhole:
     """The vapour cavity of a laser weld in a square bar, which goes on below, with pores behind it.
 
@@ -123,8 +120,7 @@ class Keyhole:
         return Drawn(scene, f"a keyhole with {self.count} pores, seed {seed}", parts)
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Lattice:
     """A cube of body-centred cubic unit cells, whose struts lead from the corners to the middle of each."""
 
@@ -158,8 +154,7 @@ class Lattice:
         return Drawn(scene, text, {"struts": RodScene(rods, SHARE)})
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Fibres:
     """Thin straight fibres about the direction of the rotation axis, which go on above and below."""
 
@@ -190,8 +185,7 @@ class Fibres:
         return Drawn(scene, f"{self.count} fibres, seed {seed}", {"fibres": RodScene(scene.rods, SHARE)})
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Channel:
     """A channel along the rotation axis in a block that is larger than the field: three materials.
 
@@ -223,8 +217,7 @@ class Channel:
         return Drawn(scene, f"a channel with {self.count} red cells, seed {seed}", parts)
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Star:
     """A Siemens star in a plane that holds the rotation axis: wedges with gaps as wide, which shows the resolution.
 

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Literal
 
 from ..checks import at_least
 from ..learning.network import Size
-from ..ranges import Natural, Positive, Rate, Seed, Share, Weight, ranged
+from ..ranges import Natural, Positive, Rate, Seed, Share, Weight, checked_dataclass
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class FrameLossWeights:
     """The training loss of networks that learn from frames alone, without volumes."""
 
@@ -28,8 +27,7 @@ class FrameLossWeights:
     """AdamW's rate of the discriminator (4D-ONIX: 1e-4)."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class ViewSampling:
     """How samples are shown, so that few scenes stand for many."""
 
@@ -41,8 +39,7 @@ class ViewSampling:
     """Rows that are cut out, where views have a common axis: bodies then go on above and below, as in a flow."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class LossWeights:
     """Weights of what is minimised."""
 
@@ -54,8 +51,7 @@ class LossWeights:
     """Of the guess before its correction, over that of the corrected one."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class TrainOptions:
     """How a network is trained."""
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 from ..checks import at_least, require
 from ..geometry import Views
-from ..ranges import Angle, Many, Natural, Pixels, Positive, Share, SomeShare, Weight, ranged
+from ..ranges import Angle, Many, Natural, Pixels, Positive, Share, SomeShare, Weight, checked_dataclass
 from ..scan import Exposures
 from ..units import wavelength
 
@@ -15,8 +14,7 @@ Kind = Literal["red-cells", "crowd", "ellipsoids", "capsules", "filled-capsules"
 """What a scene may be made of."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Ranges:
     """Ranges (least, most) that scenes are drawn from; lengths of bodies are in pixels, so that scenes of any
     magnification are the same to a network."""

@@ -29,7 +29,7 @@ from ..preprocess import (
 )
 from ..preprocess.pixels import MOST_DEFECTS, filled
 from ..progress import Advance
-from ..ranges import ranged
+from ..ranges import checked_dataclass
 from ..scan import Scan
 from .air_light import AirLight, Look
 
@@ -47,8 +47,7 @@ ENOUGH_FLATS = 3
 """Flats that the dynamic method needs."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class CorrectionOptions:
     """How raw frames are corrected."""
 

@@ -26,7 +26,7 @@ from ..motion.measures import LEAST, half_sets
 from ..motion.modes import DmdForecast, SindyForecast
 from ..optics.background import Light
 from ..progress import FitProgress
-from ..ranges import Many, Seconds, ranged
+from ..ranges import Many, Seconds, checked_dataclass
 from ..representations import MovingSurfaces
 from ..scan import Scan
 from ..tables import read_rows, to_table
@@ -46,8 +46,7 @@ SAME_TIME = 1e-3
 """Share of a step within which two times are one."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class ForecastOptions:
     """Options of a forecast."""
 

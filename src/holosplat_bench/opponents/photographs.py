@@ -31,7 +31,7 @@ from holosplat.methods.ground import ground
 from holosplat.methods.method import Method, Stage, Task
 from holosplat.model import Instrument, Model
 from holosplat.optics.retrieval import paganin
-from holosplat.ranges import Rate, Share, ranged
+from holosplat.ranges import Rate, Share, checked_dataclass
 from holosplat.representations import Encoding, Network, Stored
 from holosplat.representations.neural_field import uniform
 from holosplat.scan import Scan
@@ -39,8 +39,7 @@ from holosplat.scan import Scan
 from .photographed import AlphaCloud, RadianceField
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class AlphaRates(GaussianRates):
     """Adam's rates at the start of a fit; `raw_amplitudes` are the opacities before the logistic function."""
 
@@ -60,8 +59,7 @@ def _density() -> DensityControl:
     return DensityControl(every=50, stop=0.5, faint=0.005, max_count=20_000)
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class AlphaSplats(Method):
     """3D Gaussian splatting (Kerbl et al. 2023): random Gaussians, cloned, split and pruned, each with a grey value.
 
@@ -155,8 +153,7 @@ def _network() -> Network:
     return Network(Encoding(kind="octaves"), hidden=64, layers=3)
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class RadianceFields(Method):
     """A plain NeRF (Mildenhall et al. 2020): positional encoding, a perceptron, and emission and absorption on rays.
 

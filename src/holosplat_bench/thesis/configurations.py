@@ -21,13 +21,12 @@ from holosplat.fit.terms import Objective
 from holosplat.methods import FitOptions
 from holosplat.methods.gaussian_options import GaussianRates
 from holosplat.methods.presets import preset
-from holosplat.ranges import ranged
+from holosplat.ranges import checked_dataclass
 from holosplat.scan import Scan
 from holosplat.volume import Object, Volume
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Physics:
     """What differs from the case as it is declared; None for nothing.
 
@@ -90,8 +89,7 @@ VOLUME_TV, VOLUME_EDGE = 0.05, 32
 stands for that of the frames: those of Zha et al. 2024 (R²-Gaussian)."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Configuration:
     """A configuration in the thesis' units.
 

@@ -18,7 +18,7 @@ from ...materials import DeltaBeta, parse_material
 from ...matter import MaterialPrior
 from ...optics.detector import poisson
 from ...optics.noise import PHOTON_RANGE
-from ...ranges import Grams, Many, ManyOrNone, Metres, Photons, Pixels, Positive, Signed, Small, ranged
+from ...ranges import Grams, Many, ManyOrNone, Metres, Photons, Pixels, Positive, Signed, Small, checked_dataclass
 from ...scan import Exposures, Scan, interleaved_split
 from ...specimens.drawn import Scene, Substances
 from ...specimens.phantoms import Ball
@@ -33,8 +33,7 @@ from .specimens import Continuous, Meshed, Specimen
 MOST_PIXELS = 4096
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Substance:
     """A preset's name ("plasma"), "vacuum", a formula with its density [g/cm³], or `delta` and `beta` themselves."""
 
@@ -74,8 +73,7 @@ class Matter:
     medium: Substance = Substance("vacuum")
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Beam:
     """energy_kev: photon energy [keV]; distance: effective propagation distance [m]."""
 
@@ -83,8 +81,7 @@ class Beam:
     distance: Metres
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Detector:
     """rows, columns: pixels; pixel_size: effective pitch [m]; psf_sigma_px: of its point-spread function [pixels]."""
 
@@ -99,8 +96,7 @@ class Detector:
             require(1 <= count <= MOST_PIXELS, f"{name} must lie between 1 and {MOST_PIXELS}, but it is {count}.")
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Interleaved:
     """`count` views evenly over 180° about the y axis, the last of every `hold_out_every` held out."""
 
@@ -118,8 +114,7 @@ class Interleaved:
         return rotation_y(angles), interleaved_split(self.count, self.hold_out_every)
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Between:
     """`train` views evenly over 180° about the y axis, and `test` held-out ones, each in the middle of a gap."""
 
@@ -139,8 +134,7 @@ class Between:
         return rotation_y(angles), np.arange(len(angles)) >= self.train
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Listed:
     """Directions `[angle, tilt]` [degrees] (`geometry.rotation_tilted`) for training, and held out."""
 
@@ -159,8 +153,7 @@ class Listed:
         return rotations, np.arange(len(rotations)) >= len(self.train)
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Declaration:
     """A case without its seed. summary: one line about it; photons: mean counts a pixel of a frame for training, or
     none for frames without noise; prior: for methods, of `matter.material` against the medium; light: how it

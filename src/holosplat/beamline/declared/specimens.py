@@ -14,7 +14,7 @@ from ...checks import InputError, in_range, require
 from ...io.vtk import SUFFIXES, read_meshes
 from ...matter import DeltaBeta
 from ...mesh import TriangleMesh
-from ...ranges import Many, ManyOrNone, Metres, Seed, Share, Small, SomeShare, ranged
+from ...ranges import Many, ManyOrNone, Metres, Seed, Share, Small, SomeShare, checked_dataclass
 from ...specimens.continuous import ContinuousScene
 from ...specimens.matter import FieldMatter
 from ...specimens.phantoms import Ball, place_capsules, random_foam, star_of_balls
@@ -25,8 +25,7 @@ from ...specimens.soft_matter import body_with_absorber, coated_droplets, round_
 """`(x, y, z)` [m]."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class SoftCells:
     """`soft_cells`: `count` of them, the smallest and the largest of `diameters` [m], edges `edge` wide [m]."""
 
@@ -43,8 +42,7 @@ class SoftCells:
         return scene, f"{self.count} soft cells, seed {seed}"
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class RoundCell:
     """`round_cell` of `diameter` [m]."""
 
@@ -57,8 +55,7 @@ class RoundCell:
         return round_cell(self.diameter, matter[0], seed), f"a round cell, seed {seed}"
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Tissue:
     """`tissue`: a piece in the ellipsoid of extents `box` [m], with so many `cells` and `granules`."""
 
@@ -73,8 +70,7 @@ class Tissue:
         return tissue(self.box, matter[0], seed, self.cells, self.granules), f"a piece of tissue, seed {seed}"
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class SheppLogan:
     """`shepp_logan` of `height` [m], edges `edge` wide [m]; the seed changes nothing."""
 
@@ -88,8 +84,7 @@ class SheppLogan:
         return shepp_logan(self.height, matter[0], self.edge), f"the head phantom, for every seed, as for {seed}"
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class CoatedDroplets:
     """`coated_droplets`: `count` of them, the smallest and largest of `diameters` [m], `coating` thick [m]; their
     coating is the case's material, and what is in them is its core."""
@@ -108,8 +103,7 @@ class CoatedDroplets:
         return scene, f"{self.count} coated droplets, seed {seed}"
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class BodyWithAbsorber:
     """`body_with_absorber`: a body of extents `size` [m], and in it `beads` of the case's core, of diameter `bead`."""
 
@@ -147,8 +141,7 @@ class Bodies:
     balls: tuple[Ball, ...] = ()
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class RedCells:
     """`random_cells`: `count` cells of `diameter` [m] in the channel `box` [m], of the given `shape`, `deform` and
     `stretch` (without it: as `deform`).
@@ -174,8 +167,7 @@ class RedCells:
         return Bodies(f"{self.count} generated red cells, seed {seed}", cells)
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class CrowdedCells:
     """`crowded_cells`: cells of `diameter` [m] that fill the fraction `haematocrit` of a cylinder in `box` [m]."""
 
@@ -193,8 +185,7 @@ class CrowdedCells:
         return Bodies(text, [cell.mesh(name=f"cell{i:03d}") for i, cell in enumerate(cells)])
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Snapshots:
     """One snapshot of simulated cells, `*_000.vtk`, `*_001.vtk` … in a folder (µm), enlarged by `scale`.
 
@@ -225,8 +216,7 @@ class Snapshots:
         return Bodies(f"{len(meshes)} red cells, snapshot {number}", scaled)
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Capsules:
     """`place_capsules`: `count` of them, the smallest and largest of `diameters` [m], of the thickness `shell` [m]."""
 
@@ -246,8 +236,7 @@ class Capsules:
         return Bodies(f"{self.count} capsules, seed {seed}", outer, cores)
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class FoamDrop:
     """`random_foam`: a drop of diameter `drop` [m], `count` bubbles of log-normal diameters about `median` [m]."""
 
@@ -265,8 +254,7 @@ class FoamDrop:
         return Bodies(f"a drop with {self.count} bubbles, seed {seed}", [foam.drop.mesh(5, "drop")], cores)
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class BallStar:
     """`star_of_balls`: `2 · spokes` balls of each of the `diameters` [m], on rings that shrink as the balls do."""
 

@@ -12,14 +12,13 @@ with the kinematic viscosity ν [m²/s] (Landau and Lifshitz 1987, "Fluid Mechan
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from ...checks import at_least
 from ...model import Model
-from ...ranges import Small, Weight, ranged
+from ...ranges import Small, Weight, checked_dataclass
 from ...representations import SpaceTimeField
 from ...representations.neural_field import uniform
 from ...representations.perceptron import Jet
@@ -28,8 +27,7 @@ from ..problem import Batch, LossPart
 from ..total_variation import total_variation
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Equations:
     """Which equations bind density and velocity, and how much each counts beside frames.
 

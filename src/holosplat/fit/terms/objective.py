@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from ...checks import require
-from ...ranges import Pixels, Share, Weight, ranged
+from ...ranges import Pixels, Share, Weight, checked_dataclass
 
 IMAGE_TERMS = ("l1", "l2_amplitude", "ssim", "tv_image", "frc", "rounded", "spectral")
 """The weights of which one at least must be above zero."""
 VOLUME_TERMS = ("tv_volume", "overfull", "two_levels")
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Objective:
     """Weights of the terms; a weight of zero leaves the term out.
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ...progress import Advance
-from ...ranges import ranged
+from ...ranges import checked_dataclass
 from ...scan import Exposures
 from .contact import or_in_contact
 from .model import Regularised, WaveModel, view_by_view
@@ -23,8 +22,7 @@ COUPLING = 0.05
 """Penalty of leaving the bounds, in the curvature of the strongest frequency."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class ADMM(Regularised):
     """Options. iterations: updates of the multipliers; weight: of total variation, relative to the mean slope of the
     estimate."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -12,7 +11,7 @@ from torch.nn.functional import pad
 
 from ...checks import at_least
 from ...progress import Advance
-from ...ranges import ranged
+from ...ranges import checked_dataclass
 from ...scan import Exposures
 from ..propagation import exit_wave_of
 from .contact import or_in_contact
@@ -20,8 +19,7 @@ from .model import DARKEST, WaveModel, view_by_view
 from .spectra import Gaps, Noise, check_noise
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Projections:
     """Options of the alternating projections."""
 

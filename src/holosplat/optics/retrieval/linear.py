@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -12,7 +11,7 @@ from torch.nn.functional import pad
 
 from ...checks import require
 from ...progress import Advance
-from ...ranges import ranged
+from ...ranges import checked_dataclass
 from ...scan import Exposures
 from ...units import wavelength, wavenumber
 from .bounded import completed
@@ -44,8 +43,7 @@ FEEBLE_FLOOR = 1e-3
 SHARP_EDGED = Prior()
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Linear:
     """Options of the filters."""
 

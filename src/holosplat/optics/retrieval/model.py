@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -13,7 +12,7 @@ from torch.nn.functional import avg_pool2d, interpolate, pad
 from ...backends import device, resolve
 from ...checks import at_least
 from ...progress import Advance
-from ...ranges import Weight, ranged
+from ...ranges import Weight, checked_dataclass
 from ...scan import Exposures
 from ...units import wavelength
 from ..hologram import hologram, optical_path
@@ -45,8 +44,7 @@ CROSS_TERM = 4.0
 """Weight of the contrast's slope in the curvature; large enough that most first steps are taken."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Regularised:
     """Options of the fits through the wave optics."""
 

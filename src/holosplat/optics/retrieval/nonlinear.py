@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from ...progress import Advance
-from ...ranges import Weight, ranged
+from ...ranges import Weight, checked_dataclass
 from ...scan import Exposures
 from .contact import or_in_contact
 from .model import Regularised, WaveModel, view_by_view
@@ -23,8 +22,7 @@ STIFFEST = 1.0
 """Bound of the penalty, in the same unit, for frequencies with hardly any expected power."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Tikhonov(Regularised):
     """Options of the fit with a quadratic penalty; its iterations are accepted or refused steps."""
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from ...checks import at_least, finite, require, shaped
-from ...ranges import Weight, ranged
+from ...ranges import Weight, checked_dataclass
 from ...scan import Exposures
 from ...units import wavelength, wavenumber
 from ..noise import noise_levels, with_gaps
@@ -33,8 +33,7 @@ LEAST_SIGNAL = 0.01
 """Share of a frame's variance that is taken for signal at least, however strong its noise seems."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Prior:
     """Power expected of a phase: `1 / (f² + corner²)^decay`, f in cycles per field of view.
 

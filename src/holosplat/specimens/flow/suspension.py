@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ...checks import InputError, in_range, require
-from ...ranges import Positive, ranged
+from ...ranges import Positive, checked_dataclass
 from ..membrane.model import Membrane
 from .channel import Channel, Repulsion, contact_forces, pairs_at_a_time, wall_forces
 
@@ -65,8 +65,7 @@ PLASMA_VISCOSITY = 1.2e-3
 """Of blood plasma at 37 °C [Pa s] (Késmárky et al. 2008, Clin. Hemorheol. Microcirc. 39, 243)."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Medium:
     """The fluid, the same inside and outside the cells, and the short-ranged force in place of its thin films."""
 

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from ...checks import InputError, in_range, require
 from ...mesh import TriangleMesh
-from ...ranges import ranged
+from ...ranges import checked_dataclass
 from .rest import (
     RestShape,
     angle_between,
@@ -123,8 +123,7 @@ def _gathered(nodes: Tensor, index: Tensor, forces: Tensor) -> Tensor:
     return torch.zeros_like(nodes).index_add(-2, index.reshape(-1), flat)
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Elasticity:
     """Elastic moduli of a membrane; a modulus of 0 leaves the energy out.
 

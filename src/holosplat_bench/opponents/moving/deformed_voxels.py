@@ -20,7 +20,7 @@ from holosplat.geometry import Grid
 from holosplat.matter import Matter
 from holosplat.methods.assumed import assumed_material
 from holosplat.methods.method import Method, Stage, Task, quiet
-from holosplat.ranges import Pixels, Rate, Weight, ranged
+from holosplat.ranges import Pixels, Rate, Weight, checked_dataclass
 from holosplat.representations import Stored, VoxelGrid
 from holosplat.representations.voxels import along_axes
 from holosplat.tables import from_table, to_table
@@ -34,8 +34,7 @@ NETWORK = "network."
 """Before the names of the weights."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Deformation:
     """Options of the network and of the canonical voxels."""
 
@@ -209,8 +208,7 @@ def _fit() -> TimesFit:
     return TimesFit(drawn=DrawnTimes(opening=0.6))
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class Deformed(Method):
     """Options of canonical matter and its deformation."""
 

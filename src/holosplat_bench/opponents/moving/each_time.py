@@ -25,7 +25,7 @@ from holosplat.methods.method import Method, Stage, Task, finished, quiet, solve
 from holosplat.methods.pinn import FEWEST_TIMES
 from holosplat.methods.solve import settled
 from holosplat.progress import Progress
-from holosplat.ranges import Weight, ranged
+from holosplat.ranges import Weight, checked_dataclass
 from holosplat.representations import Stored
 from holosplat.scan import Scan
 
@@ -147,8 +147,7 @@ class EachTime(Method):
         return (EachTimeStage(self.volume),)
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class SpaceTimeFit:
     """Options of voxels of all times and their fit."""
 

@@ -19,7 +19,7 @@ from holosplat.geometry import Grid
 from holosplat.matter import Matter
 from holosplat.methods.assumed import assumed_material
 from holosplat.methods.method import Method, Stage, Task
-from holosplat.ranges import Pixels, Rate, Share, Weight, ranged
+from holosplat.ranges import Pixels, Rate, Share, Weight, checked_dataclass
 from holosplat.representations import Stored, VoxelGrid
 from holosplat.tables import from_table, to_table
 
@@ -32,8 +32,7 @@ PAIRS = (("xy", "zt"), ("xz", "yt"), ("yz", "xt"))
 TIME_PLANES = tuple(second for _, second in PAIRS)
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class HexPlanes:
     """Options of the field."""
 
@@ -173,8 +172,7 @@ def hats(cells: int, nodes: int) -> Tensor:
     return torch.from_numpy(np.clip(1 - np.abs(places[:, None] - np.arange(nodes)), 0, None)).float()
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class HexPlane(Method):
     """Options of a field of six planes: its start is random, as published."""
 
@@ -263,8 +261,7 @@ class Jerkiness:
         return torch.stack(bends).sum() * seen[0][1].values.numel()
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class LowRank(Method):
     """Options of voxels of low rank, and of their start."""
 

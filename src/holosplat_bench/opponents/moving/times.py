@@ -21,7 +21,7 @@ from holosplat.fit.total_variation import total_variation
 from holosplat.methods.ground import Ground, ground
 from holosplat.methods.method import Task
 from holosplat.model import Model
-from holosplat.ranges import Share, Weight, ranged
+from holosplat.ranges import Share, Weight, checked_dataclass
 from holosplat.representations import Stored, VoxelGrid
 from holosplat.scan import Scan
 from holosplat.volume import Object
@@ -32,8 +32,7 @@ VOLUMES = "object.volumes"
 """The parameter of a `VoxelSeries`."""
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class DrawnTimes:
     """Which times a step looks at."""
 
@@ -248,8 +247,7 @@ def spectral_objective() -> Objective:
     return Objective(l1=0.0, spectral=1.0, floor=0.1)
 
 
-@dataclass(frozen=True)
-@ranged
+@checked_dataclass
 class TimesFit:
     """How a field of space and time is fitted to the frames."""
 
