@@ -20,7 +20,7 @@ from rows import written
 
 from holosplat.beamline.light import correlated_field
 from holosplat.optics import background
-from holosplat.optics.noise_model import NoiseModel
+from holosplat.optics.noise import NoiseModel
 
 PARTS, NOISES = (0.0, 0.02, 0.04, 0.08, 0.15, 0.25), (0.0, 0.0003, 0.001, 0.002, 0.01, 0.03)
 WORST = 5.0

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 import holosplat as hs
 from holosplat.align import PoseOptions, PosePrior, align_views
-from holosplat.align.changes import moved_onto
+from holosplat.align.derivatives import moved_onto
 from holosplat.beamline.declared.declaration import Case
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.methods import Auto, Gaussians, Method

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 import holosplat as hs
 from holosplat.align import calibrate
-from holosplat.align.changes import changes, moved_onto
+from holosplat.align.derivatives import changes, moved_onto
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.geometry import Views, rotation_tilted
 from holosplat.specimens.red_cells import icosphere

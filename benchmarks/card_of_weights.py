@@ -15,7 +15,7 @@ from rows import read
 
 from holosplat.learning.weights import SHIPPED, Card, read_weights, write_weights
 from holosplat.tables import from_table, to_table
-from holosplat.training.ranges import Ranges
+from holosplat.training.options import Ranges
 from holosplat.training.train import limits
 
 RUNS = Path(__file__).resolve().parents[1] / "docs" / "data" / "learned.csv"

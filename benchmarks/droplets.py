@@ -21,7 +21,7 @@ from rows import machine, read, replaced, shown
 
 from holosplat.motion.particles import Particle, ParticleOptions, find_particles, link_particles
 from holosplat.optics.resampling import InLine, register
-from holosplat.preprocess.flat_field import fixed_background
+from holosplat.preprocess.pixels import fixed_background
 
 DATA = Path(__file__).resolve().parents[1] / "docs" / "data"
 WAVELENGTH, PIXEL, RATE = 0.6328e-6, 10e-6, 4000.0

@@ -27,7 +27,7 @@ from holosplat.optics.patterns import smooth_modes
 from holosplat.scan import Exposures, Scan
 from holosplat.units import wavelength, wavenumber
 from holosplat_bench.suite.families import SIMULATED, Scene, log_uniform, told_photons
-from holosplat_bench.suite.measured import MEASURED
+from holosplat_bench.suite.prepare import MEASURED
 
 LIGHT_ORDER = 2
 """Half waves of the light beside which held-out frames are compared."""

@@ -41,7 +41,7 @@ from holosplat.motion.modes import DmdForecast, SindyForecast
 from holosplat.motion.track import TrackOptions, follow
 from holosplat.representations import MovingSurfaces
 from holosplat.representations.paths import TimeBasis
-from holosplat.specimens.mesh_series import MeshSeries
+from holosplat.specimens.scene import MeshSeries
 from holosplat.workflows.evaluate import render_object
 from motion import ANGLES, BODY, MATERIAL, PIXEL, SHAPE, cells_in_flow, imaged
 

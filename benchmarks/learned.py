@@ -36,7 +36,7 @@ from holosplat.methods.volume import material_of_levels
 from holosplat.metrics import volume_scores
 from holosplat.specimens.continuous import ContinuousScene
 from holosplat.specimens.scene import MeshScene
-from holosplat.training.ranges import Kind, Ranges
+from holosplat.training.options import Kind, Ranges
 from holosplat.training.sample import drawn_case
 from motion import MATERIAL, PHOTONS, PIXEL, SHAPE, cells_in_flow
 

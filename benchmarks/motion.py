@@ -35,8 +35,8 @@ from holosplat.motion.fit import MotionFit
 from holosplat.motion.measures import area, standard_errors
 from holosplat.motion.track import Followed, TrackOptions, follow
 from holosplat.representations import MovingSurfaces
-from holosplat.specimens.mesh_series import MeshSeries
 from holosplat.specimens.red_cells import icosphere
+from holosplat.specimens.scene import MeshSeries
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "data" / "motion.csv"
 ABLATION = PAGE.with_name("motion_ablation.csv")

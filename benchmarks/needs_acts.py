@@ -38,9 +38,9 @@ from holosplat.planning import acts
 from holosplat.planning.needs import Needs, of_reconstruction
 from holosplat.planning.needs import Sizes as NeedsSizes
 from holosplat.scan import Exposures
-from holosplat.specimens.membrane.resting import nodes_of
+from holosplat.specimens.membrane.rest import nodes_of
 from holosplat.specimens.red_cells import random_cells
-from holosplat.training.ranges import Ranges
+from holosplat.training.options import Ranges
 from holosplat_bench.suite.case import planned_frames
 from holosplat_bench.suite.methods import METHODS as BENCH_METHODS
 from holosplat_bench.suite.methods import of_methods

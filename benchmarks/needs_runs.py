@@ -22,7 +22,7 @@ from needs import peak
 from rows import read, write
 
 from holosplat.io import read_scan
-from holosplat.io.json import read_json
+from holosplat.io.atomic import read_json
 from holosplat.matter import MatterKind
 from holosplat.methods import Auto
 from holosplat.planning.needs import Sizes, of_reconstruction

@@ -31,8 +31,7 @@ from holosplat.geometry import Grid
 from holosplat.methods import Onix
 from holosplat.training.aligned import AlignedTraining, AlignedValidation
 from holosplat.training.folder import Dataset, make_dataset
-from holosplat.training.options import FrameLossWeights, TrainOptions, ViewSampling
-from holosplat.training.ranges import Ranges
+from holosplat.training.options import FrameLossWeights, Ranges, TrainOptions, ViewSampling
 from holosplat.training.sample import drawn_case
 from holosplat.training.shown import Validation
 from holosplat.training.train import WEIGHTS, made_by

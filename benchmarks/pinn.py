@@ -39,7 +39,7 @@ from holosplat.methods.illumination import prepared
 from holosplat.methods.pinn import EachTime
 from holosplat.metrics import volume_scores
 from holosplat.representations import SpaceTimeField
-from holosplat.specimens.mesh_series import MeshSeries
+from holosplat.specimens.scene import MeshSeries
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "data" / "pinn.csv"
 SHAPE, PHOTONS, TIMES = (64, 48), 1000.0, 6

@@ -40,7 +40,7 @@ from holosplat.beamline.light import UnevenLight
 from holosplat.geometry import Grid
 from holosplat.metrics import volume_scores
 from holosplat.units import wavelength
-from holosplat_bench.suite.random_specimens import KINDS, Draw, Room
+from holosplat_bench.suite.families import KINDS, Draw, Room
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "data" / "random_scenes.csv"
 PURPOSE = 99

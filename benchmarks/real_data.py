@@ -36,8 +36,8 @@ from holosplat.model import measure
 from holosplat.optics.background import LightOptions
 from holosplat.projectors.voxels import voxel_line_integrals
 from holosplat.version import source_commit
-from holosplat_bench.suite.measured import MEASURED, agreement, back_projected
 from holosplat_bench.suite.methods import METHODS
+from holosplat_bench.suite.prepare import MEASURED, agreement, back_projected
 
 ROOT = Path(__file__).resolve().parents[1]
 TABLE, PICTURES = ROOT / "docs/data/real_data.csv", ROOT / "docs/images/real_data"

@@ -59,8 +59,8 @@ from holosplat.series.folder import Row, SeriesFolder
 from holosplat.series.plan import Cut, Settings, Warm, plan_series
 from holosplat.series.run import PROGRAM, states
 from holosplat.series.task import run_task
-from holosplat.specimens.mesh_series import MeshSeries
 from holosplat.specimens.red_cells import random_cells
+from holosplat.specimens.scene import MeshSeries
 
 PIXEL, CELL_PX, PHOTONS, STEP_PX = 0.5e-6, 16.0, 1000.0, 0.3
 ANGLES = (0.0, 45.0, 90.0, 135.0)

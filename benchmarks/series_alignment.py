@@ -21,11 +21,11 @@ from scipy.spatial.transform import Rotation
 
 import holosplat as hs
 from holosplat.align import Drift, PoseOptions, align_views
-from holosplat.align.changes import moved_onto
+from holosplat.align.derivatives import moved_onto
 from holosplat.beamline.misalignment import GEOMETRIES, Directions, Geometry, Misalignment
 from holosplat.mesh import TriangleMesh
 from holosplat.metrics import volume_scores
-from holosplat.specimens.mesh_series import MeshSeries
+from holosplat.specimens.scene import MeshSeries
 from holosplat.version import source_commit
 
 TIMES, SECONDS = 16, 1e-3

@@ -30,7 +30,7 @@ import holosplat as hs
 from holosplat.beamline.simulate import Simulation, simulated_frames
 from holosplat.io.nxtomo import scan_writer
 from holosplat.io.volumes import write_voxels
-from holosplat.specimens.mesh_series import MeshSeries
+from holosplat.specimens.scene import MeshSeries
 from holosplat.workflows.provenance import environment
 
 SEED, CELLS, DIAMETER = 1, 16, 8e-6

@@ -32,7 +32,7 @@ import holosplat as hs
 from holosplat.backends import device_name, resolve
 from holosplat.fit.fidelity import Target, l1_and_ssim
 from holosplat.fit.loop import Fit
-from holosplat.fit.schedule import Schedule
+from holosplat.fit.problem import Schedule
 from holosplat.fit.terms import Objective
 from holosplat.geometry import Poses
 from holosplat.matter import Matter

@@ -25,7 +25,7 @@ from changes import changed
 from machine import commit
 
 import holosplat as hs
-from holosplat.io.json import write_json
+from holosplat.io.atomic import write_json
 from holosplat.methods import Extraction, SurfaceFit, SurfaceOptions, finished
 from holosplat.methods.surface_fit import extract_surfaces, oversampling, surface_fit
 from holosplat.representations import GaussianCloud, SurfaceMesh

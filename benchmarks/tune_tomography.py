@@ -25,8 +25,7 @@ import torch
 from machine import commit
 
 import holosplat as hs
-from holosplat.baselines.algebraic import Algebraic, art, sirt
-from holosplat.baselines.filtered_backprojection import Ramp, filtered_backprojection
+from holosplat.baselines.algebraic import Algebraic, Ramp, art, filtered_backprojection, sirt
 from holosplat.baselines.tomography import TOMOGRAPHIES, TotalVariation, total_variation
 from holosplat.matter import Matter
 from holosplat.methods.per_view import Mbir, svmbir_volume

@@ -20,7 +20,7 @@ from machine import commit
 
 from holosplat.io.atomic import atomic_path
 from holosplat.specimens.membrane.model import Elasticity, Membrane, Stretched, stretch
-from holosplat.specimens.membrane.resting import resting_cell
+from holosplat.specimens.membrane.rest import resting_cell
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt

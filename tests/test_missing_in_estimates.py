@@ -12,8 +12,7 @@ import torch
 from helpers.misaligned_balls import MATERIAL
 from helpers.misaligned_balls import scan_of as misaligned
 from holosplat.align import find_axis
-from holosplat.align.derivatives import Predicted
-from holosplat.align.newton import Normal
+from holosplat.align.derivatives import Normal, Predicted
 from holosplat.align.phantom import Linear, solved
 from holosplat.align.poses import PoseOptions, PosePrior
 from holosplat.align.views import align_still

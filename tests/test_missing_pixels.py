@@ -24,8 +24,7 @@ from holosplat.io.reading import Part, Reading
 from holosplat.materials import parse_material
 from holosplat.matter import Matter
 from holosplat.model import Instrument
-from holosplat.optics.noise import left_of
-from holosplat.optics.noise_model import NoiseModel
+from holosplat.optics.noise import NoiseModel, left_of
 from holosplat.optics.retrieval import RETRIEVALS
 from holosplat.preprocess.pixels import filled
 from holosplat.scan import Exposures, Scan

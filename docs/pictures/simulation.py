@@ -15,7 +15,7 @@ import holosplat as hs
 from holosplat.beamline.misalignment import Directions, Misalignment
 from holosplat.beamline.simulate import Shutter
 from holosplat.report.style import PanelGrid, image_panel, letter, scale_bar, styled
-from holosplat.specimens.mesh_series import MeshSeries
+from holosplat.specimens.scene import MeshSeries
 
 from .drawing import COMMIT
 

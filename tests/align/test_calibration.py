@@ -13,7 +13,7 @@ import holosplat as hs
 from helpers.polycube import polycube
 from holosplat.align import CalibrationOptions, PosePrior, calibrate
 from holosplat.align.calibration import Calibrated, _Search
-from holosplat.align.changes import changes, moved_onto
+from holosplat.align.derivatives import changes, moved_onto
 from holosplat.align.phantom import Phantom, centre_of_mass, linearised, solved
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.geometry import Views, rotation_tilted

@@ -10,8 +10,7 @@ import torch
 
 from helpers.misaligned_balls import BALLS, MATERIAL, PIXEL, SHAPE, scan_of
 from holosplat.align import AlignedViews, PoseOptions, PosePrior, align_views
-from holosplat.align.derivatives import NUMBERS, in_pixels, predicted
-from holosplat.align.newton import blurred
+from holosplat.align.derivatives import NUMBERS, blurred, in_pixels, predicted
 from holosplat.align.poses import PoseSearch
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.checks import InputError

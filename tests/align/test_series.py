@@ -12,10 +12,8 @@ from scipy.spatial.transform import Rotation
 from helpers.misaligned_balls import MATERIAL, PIXEL
 from helpers.moving_balls import beams, series
 from holosplat.align import AlignedBeams, Drift, PoseOptions, PosePrior, align_views
-from holosplat.align.changes import moved_onto
-from holosplat.align.derivatives import NUMBERS
+from holosplat.align.derivatives import NUMBERS, Normal, moved_onto
 from holosplat.align.find import DRIFT, LINEAR, STAY
-from holosplat.align.newton import Normal
 from holosplat.align.series_search import Beams, Moment, SeriesSearch, chosen_moments
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.checks import InputError

@@ -9,8 +9,7 @@ import torch
 from helpers.misaligned_balls import MATERIAL
 from helpers.moving_balls import beams, series
 from holosplat.align import Drift, PoseOptions, PosePrior
-from holosplat.align.derivatives import NUMBERS
-from holosplat.align.newton import Normal
+from holosplat.align.derivatives import NUMBERS, Normal
 from holosplat.align.poses import DISTANCE, MAGNIFICATION, Level, PoseSearch
 from holosplat.align.series_search import Moment, SeriesSearch
 from holosplat.beamline.misalignment import Misalignment

@@ -13,11 +13,9 @@ from torch.nn.functional import interpolate, pad
 from helpers.discs import ball_lines
 from helpers.misaligned_balls import BALLS, MATERIAL, PIXEL, scan_of
 from holosplat.align import AlignedViews, PoseOptions, PosePrior, align_views
-from holosplat.align.changes import moved_onto
-from holosplat.align.derivatives import NUMBERS, Predicted, in_pixels, projections
+from holosplat.align.derivatives import NUMBERS, Normal, Predicted, blurred, in_pixels, moved_onto, projections, step
 from holosplat.align.fixed_matter import EDGES, SURFACES, VOXELS
 from holosplat.align.initial_geometry import mirrored, shifts_by_mass
-from holosplat.align.newton import Normal, blurred, step
 from holosplat.align.views import PLANNED, POSES, Judged
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.checks import InputError

@@ -9,7 +9,7 @@ from torch.nn.functional import pad
 
 from helpers.discs import ball_lines
 from helpers.misaligned_balls import BALLS, MATERIAL
-from holosplat.baselines.filtered_backprojection import filtered_backprojection
+from holosplat.baselines.algebraic import filtered_backprojection
 from holosplat.baselines.tomography import TotalVariation, total_variation
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views, rotation_tilted

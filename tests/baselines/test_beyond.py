@@ -20,7 +20,7 @@ from holosplat.methods.method import Task
 from holosplat.methods.modulation import total_delta
 from holosplat.methods.surface_fit import field_of
 from holosplat.methods.volume import SmoothStage, SmoothVolume
-from holosplat.optics.noise_model import NoiseModel
+from holosplat.optics.noise import NoiseModel
 from holosplat.optics.retrieval import bounded_estimate
 from holosplat.optics.retrieval.bounded import NOWHERE
 from holosplat.representations import GaussianCloud, VoxelGrid

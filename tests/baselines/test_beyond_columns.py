@@ -17,7 +17,7 @@ from holosplat.methods.method import Task
 from holosplat.methods.modulation import total_delta
 from holosplat.methods.volume import SmoothStage, SmoothVolume
 from holosplat.methods.voxels import VoxelFit, VoxelStage
-from holosplat.optics.noise_model import NoiseModel
+from holosplat.optics.noise import NoiseModel
 from holosplat.optics.retrieval import bounded_estimate
 from holosplat.representations import VoxelGrid
 from holosplat.scan import Scan

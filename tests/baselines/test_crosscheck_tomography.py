@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from holosplat.baselines.algebraic import Algebraic, sirt
-from holosplat.baselines.filtered_backprojection import Ramp, filtered_backprojection
+from holosplat.baselines.algebraic import Algebraic, Ramp, filtered_backprojection, sirt
 from holosplat.checks import InputError, MissingError
 from holosplat.geometry import Grid, Views
 from holosplat.methods import per_view as other

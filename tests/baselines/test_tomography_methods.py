@@ -11,8 +11,17 @@ from torch import Tensor
 
 from helpers.discs import ANGLES, PITCH, anyhow, ball_lines, ball_truth, quiet, turned
 from holosplat.baselines import PrimalDual
-from holosplat.baselines.algebraic import Algebraic, _masks, _orthogonal_sets, art, sirt
-from holosplat.baselines.filtered_backprojection import Ramp, angular_weights, filtered_backprojection, ramp
+from holosplat.baselines.algebraic import (
+    Algebraic,
+    Ramp,
+    _masks,
+    _orthogonal_sets,
+    angular_weights,
+    art,
+    filtered_backprojection,
+    ramp,
+    sirt,
+)
 from holosplat.baselines.rays import rays_of
 from holosplat.baselines.tomography import TotalVariation, misfit_spectrum, total_variation
 from holosplat.checks import InputError

@@ -17,7 +17,7 @@ from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
 from holosplat.fit.terms import comparisons as terms
 from holosplat.geometry import Grid, Views
-from holosplat.io.json import read_json
+from holosplat.io.atomic import read_json
 from holosplat.io.nxtomo import write_scan
 from holosplat.io.objects import read_object, write_object
 from holosplat.materials import Compound, DeltaBeta

@@ -12,8 +12,7 @@ from holosplat.beamline.simulate import Filling, Simulation, polychromatic_frame
 from holosplat.checks import InputError
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.optics.coherence import Spectrum
-from holosplat.specimens.mesh_series import MeshSeries
-from holosplat.specimens.scene import MeshScene
+from holosplat.specimens.scene import MeshScene, MeshSeries
 
 
 def test_a_spectrum_is_the_incoherent_sum_of_its_energies():

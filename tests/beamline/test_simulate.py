@@ -22,9 +22,8 @@ from holosplat.materials import DeltaBeta
 from holosplat.mesh import TriangleMesh
 from holosplat.model import measure
 from holosplat.scan import Exposures, Scan
-from holosplat.specimens.mesh_series import MeshSeries
 from holosplat.specimens.red_cells import icosphere
-from holosplat.specimens.scene import MeshScene
+from holosplat.specimens.scene import MeshScene, MeshSeries
 
 PIXEL = 1e-6
 SHAPE = (31, 44)

@@ -10,9 +10,8 @@ from holosplat.beamline.simulate import Shutter, Simulation, simulated_frames
 from holosplat.geometry import Views
 from holosplat.matter import DeltaBeta
 from holosplat.scan import Exposures
-from holosplat.specimens.mesh_series import MeshSeries
 from holosplat.specimens.red_cells import random_cells
-from holosplat.specimens.scene import MeshScene
+from holosplat.specimens.scene import MeshScene, MeshSeries
 from holosplat.specimens.soft_matter import shepp_logan
 from holosplat.volume import Object
 

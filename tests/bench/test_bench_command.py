@@ -12,7 +12,7 @@ from helpers.bench_shop import SHAPES, Recorder, fail, make_case, suite
 from helpers.cli import holosplat as run_command
 from holosplat import version
 from holosplat_bench.suite.folder import BenchFolder
-from holosplat_bench.suite.measured import MEASURED
+from holosplat_bench.suite.prepare import MEASURED
 from holosplat_bench.suite.run import chosen, run_suite
 
 pytestmark = pytest.mark.usefixtures("unjudged_runs")

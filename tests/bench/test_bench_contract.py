@@ -11,8 +11,7 @@ import torch
 import holosplat as hs
 from helpers.contract import MATERIAL, PHOTOGRAPHS, PITCH, QUICK, SCENE, SHAPE, run, usable
 from holosplat.model import Instrument, Model
-from holosplat_bench.suite.method import BenchMethod
-from holosplat_bench.suite.methods import METHODS
+from holosplat_bench.suite.methods import METHODS, BenchMethod
 
 pytestmark = pytest.mark.usefixtures("decided")
 

@@ -8,8 +8,7 @@ from scipy.spatial.transform import Rotation
 
 import holosplat as hs
 from helpers.contract import MATERIAL, PITCH, QUICK, QUICKER, SCENE, SHAPE, run, usable
-from holosplat_bench.suite.method import BenchMethod
-from holosplat_bench.suite.methods import METHODS
+from holosplat_bench.suite.methods import METHODS, BenchMethod
 
 pytestmark = pytest.mark.usefixtures("decided")
 

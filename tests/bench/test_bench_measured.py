@@ -16,8 +16,8 @@ from holosplat.units import wavenumber
 from holosplat.volume import Volume
 from holosplat_bench.suite import measured
 from holosplat_bench.suite.folder import BenchFolder
-from holosplat_bench.suite.measured import MEASURED, agreement, missing_data
 from holosplat_bench.suite.methods import METHODS
+from holosplat_bench.suite.prepare import MEASURED, agreement, missing_data
 from holosplat_bench.suite.run import Suite, run_suite
 
 pytestmark = pytest.mark.usefixtures("unjudged_runs")

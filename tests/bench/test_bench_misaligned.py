@@ -12,14 +12,13 @@ from scipy.spatial.transform import Rotation
 
 import holosplat as hs
 from helpers.bench_shop import MATERIAL, PITCH
-from holosplat.align.changes import moved_onto
+from holosplat.align.derivatives import moved_onto
 from holosplat.beamline.declared.declaration import Case
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.matter import Matter
 from holosplat.representations.voxels import VoxelGrid
 from holosplat.specimens.red_cells import icosphere
-from holosplat_bench.suite.method import by_mass, by_reprojection
-from holosplat_bench.suite.methods import ALIGNED, METHODS
+from holosplat_bench.suite.methods import ALIGNED, METHODS, by_mass, by_reprojection
 from holosplat_bench.suite.prepare import described, fingerprint
 from holosplat_bench.suite.run import Move, judged_with
 
@@ -132,7 +131,7 @@ def test_a_method_gets_the_aligned_views(case, scan, monkeypatch):
         given.append(train)
         return SimpleNamespace(object="found")
 
-    monkeypatch.setattr("holosplat_bench.suite.method.reconstruct", reconstruct)
+    monkeypatch.setattr("holosplat_bench.suite.methods.reconstruct", reconstruct)
     there = scan.train()[[0, 1]]
     method = replace(METHODS["gaussians"], aligner=lambda *_: there)
     assert method.run(scan.train(), case.prior, 0, lambda *_: None) == "found"

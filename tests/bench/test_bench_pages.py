@@ -12,7 +12,7 @@ from matplotlib.text import Text
 
 from helpers.bench_rows import failed, make, results, row
 from holosplat.checks import InputError
-from holosplat.io.json import write_json
+from holosplat.io.atomic import write_json
 from holosplat_bench.suite.folder import REFERENCE, BenchFolder
 from holosplat_bench.suite.pages.page import escaped
 from holosplat_bench.suite.pages.pictures import Shown, holograms_figure, slices_figure

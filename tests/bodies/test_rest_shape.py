@@ -9,7 +9,7 @@ from holosplat.bodies.rest_shape import GUESSED, KnownBody, extent_like, guessed
 from holosplat.checks import InputError
 from holosplat.io.vtk import write_mesh
 from holosplat.mesh import TriangleMesh
-from holosplat.specimens.membrane.resting import resting_cell
+from holosplat.specimens.membrane.rest import resting_cell
 from holosplat.specimens.red_cells import evans_fung_cell, icosphere
 
 

@@ -7,7 +7,7 @@ from helpers.cli import holosplat, refused, worked
 from holosplat.learning.weights import read_aligned
 from holosplat.representations import AlignedNetwork
 from holosplat.training.folder import Dataset
-from holosplat.training.ranges import Ranges
+from holosplat.training.options import Ranges
 
 
 def test_a_network_is_trained_and_the_method_of_its_name_takes_it(tmp_path, monkeypatch, shop, unjudged_runs):

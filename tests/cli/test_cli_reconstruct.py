@@ -15,7 +15,7 @@ import pytest
 
 from helpers.cli import COLUMNS, PIXEL, QUICK, ROWS, holosplat, known, refused, worked
 from holosplat.cli.progress import ProgressBar
-from holosplat.fit.schedule import Schedule
+from holosplat.fit.problem import Schedule
 from holosplat.geometry import Grid
 from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.io.volumes import read_volume

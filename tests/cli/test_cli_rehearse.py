@@ -11,7 +11,7 @@ import pytest
 import holosplat as hs
 from helpers.cli import holosplat, refused, worked
 from holosplat.cli import view
-from holosplat.io.json import read_json, write_json
+from holosplat.io.atomic import read_json, write_json
 from holosplat.show.parts import LEVEL, likely_surfaces
 from holosplat.workflows import next_step, rehearsal
 

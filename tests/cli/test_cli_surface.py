@@ -15,10 +15,10 @@ from helpers.cli import Outcome, holosplat, worked
 from holosplat.baselines import HolographicTV
 from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
-from holosplat.fit.schedule import Schedule
+from holosplat.fit.problem import Schedule
 from holosplat.fit.terms import Objective
 from holosplat.geometry import Grid, Views
-from holosplat.io.json import read_json, write_json
+from holosplat.io.atomic import read_json, write_json
 from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.io.objects import write_object
 from holosplat.io.volumes import write_volume

@@ -16,7 +16,7 @@ from holosplat import native
 from holosplat.checks import InputError, MissingError
 from holosplat.fit.density import DensityControl
 from holosplat.fit.loop import Fit
-from holosplat.fit.schedule import Schedule
+from holosplat.fit.problem import Schedule
 from holosplat.fit.terms import Objective
 from holosplat.geometry import Views
 from holosplat.matter import Matter

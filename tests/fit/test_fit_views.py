@@ -14,8 +14,8 @@ from helpers.fit_balls import HASTY, PIXEL, SHAPE, a_cloud, a_scan, cloud_of, eq
 from holosplat.checks import InputError
 from holosplat.fit.loop import Fit
 from holosplat.fit.optimiser import Adam
+from holosplat.fit.problem import Schedule
 from holosplat.fit.residuals import split_validation
-from holosplat.fit.schedule import Schedule
 from holosplat.fit.terms import Objective
 from holosplat.fit.terms import comparisons as terms
 from holosplat.geometry import Views

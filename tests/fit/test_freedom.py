@@ -10,12 +10,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from helpers.bumpy import bumpy, surfaces
-from holosplat.align.changes import moved_onto
+from holosplat.align.derivatives import moved_onto
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.checks import InputError
 from holosplat.fit.pose_refinement import GeometryPrior, PoseRefinement, mean_distance_error, projection, with_alignment
-from holosplat.fit.problem import Batch
-from holosplat.fit.schedule import Schedule
+from holosplat.fit.problem import Batch, Schedule
 from holosplat.geometry import Views, rotation_y
 from holosplat.methods.surface_fit import SurfaceFit, surface_fit
 from holosplat.model import Alignment, Instrument, Model, measure

@@ -10,7 +10,7 @@ from torch import Tensor
 from helpers.blobs import MATERIAL, SHAPE, blob_scan
 from holosplat.fit.whitened import LightProjection, WhitenedFrames
 from holosplat.optics.background import Background, Light
-from holosplat.optics.noise_model import NoiseModel
+from holosplat.optics.noise import NoiseModel
 from holosplat.optics.patterns import smooth_modes
 
 ORDER, POWER, MODES = 2, 0.01, 9

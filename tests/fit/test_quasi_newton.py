@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from holosplat.checks import InputError
-from holosplat.fit.problem import Batch, Batches
+from holosplat.fit.problem import Batch, Batches, Schedule
 from holosplat.fit.quasi_newton import LONGER, QuasiNewton, direction
-from holosplat.fit.schedule import Schedule
 
 SHAPE = (3, 7, 5)
 CURVATURES = torch.from_numpy(np.random.default_rng(0).uniform(1.0, 300.0, SHAPE))

@@ -13,7 +13,7 @@ from holosplat.checks import InputError
 from holosplat.fit.smooth_volume import ContinuousPrior, Descent, VolumeProblem, descend
 from holosplat.fit.whitened import WhitenedFrames
 from holosplat.geometry import Grid
-from holosplat.optics.noise_model import NoiseModel
+from holosplat.optics.noise import NoiseModel
 
 PRIOR = ContinuousPrior()
 

@@ -11,7 +11,7 @@ from helpers.two_balls import scan
 from holosplat.fit.whitened import WhitenedFrames, model_error
 from holosplat.geometry import Views
 from holosplat.model import LightField, smooth_modes
-from holosplat.optics.noise_model import NoiseModel
+from holosplat.optics.noise import NoiseModel
 from holosplat.scan import Exposures, Scan
 
 

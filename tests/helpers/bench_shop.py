@@ -15,7 +15,7 @@ from holosplat.matter import Matter
 from holosplat.methods import Task
 from holosplat.representations.voxels import VoxelGrid
 from holosplat.specimens.red_cells import icosphere
-from holosplat_bench.suite.method import BenchMethod
+from holosplat_bench.suite.methods import BenchMethod
 from holosplat_bench.suite.run import Suite
 
 MATERIAL = hs.DeltaBeta(2e-7, 2e-10)

@@ -17,7 +17,7 @@ from tyro import _unsafe_cache
 
 from holosplat.baselines import HolographicTV
 from holosplat.cli import main
-from holosplat.fit.schedule import Schedule
+from holosplat.fit.problem import Schedule
 from holosplat.fit.terms import Objective
 from holosplat.methods import FitOptions, Gaussians
 

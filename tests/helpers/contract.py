@@ -16,8 +16,7 @@ from holosplat.methods import AlignedFit, Onix, PixelNerf, SmoothVolume
 from holosplat.representations import AlignedNetwork, Encoding, Network
 from holosplat.specimens.red_cells import icosphere
 from holosplat_bench.opponents.photographs import AlphaRates, AlphaSplats, RadianceFields
-from holosplat_bench.suite.method import BenchMethod
-from holosplat_bench.suite.methods import METHODS, methods
+from holosplat_bench.suite.methods import METHODS, BenchMethod, methods
 from holosplat_bench.suite.methods import PHOTOGRAPHS as PHOTOGRAPHIC
 
 MATERIAL = hs.DeltaBeta(2e-7, 2e-10)

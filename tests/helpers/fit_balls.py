@@ -9,7 +9,7 @@ from torch import Tensor
 from holosplat.beamline.simulate import simulate
 from holosplat.fit.density import DensityControl
 from holosplat.fit.loop import Fit
-from holosplat.fit.schedule import Schedule
+from holosplat.fit.problem import Schedule
 from holosplat.fit.terms import Objective
 from holosplat.geometry import Views
 from holosplat.matter import Matter

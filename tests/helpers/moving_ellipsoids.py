@@ -11,8 +11,8 @@ import holosplat as hs
 from holosplat.matter import Matter
 from holosplat.mesh import TriangleMesh
 from holosplat.representations import MovingSurfaces, TimeBasis
-from holosplat.specimens.mesh_series import MeshSeries
 from holosplat.specimens.red_cells import icosphere
+from holosplat.specimens.scene import MeshSeries
 
 PIXEL, STEP, TIMES = 1e-6, 1e-5, 5
 MATERIAL = hs.materials.HAEMOGLOBIN.delta_beta(20.0)

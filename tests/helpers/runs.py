@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from holosplat.baselines import HolographicTV
 from holosplat.fit.density import DensityControl
-from holosplat.fit.schedule import Schedule
+from holosplat.fit.problem import Schedule
 from holosplat.fit.terms import Objective
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.matter import MaterialPrior

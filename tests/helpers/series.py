@@ -18,9 +18,8 @@ from holosplat.mesh import TriangleMesh
 from holosplat.scan import Exposures, Scan
 from holosplat.series.folder import SeriesFolder
 from holosplat.series.plan import Cut, Settings, plan_series
-from holosplat.specimens.mesh_series import MeshSeries
 from holosplat.specimens.red_cells import random_cells
-from holosplat.specimens.scene import MeshScene
+from holosplat.specimens.scene import MeshScene, MeshSeries
 
 SHAPE, TIMES = (19, 23), 5
 CELL = HAEMOGLOBIN.delta_beta(20.0)

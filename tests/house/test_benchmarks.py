@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from holosplat.fit.schedule import Schedule
+from holosplat.fit.problem import Schedule
 from holosplat.fit.terms import Objective
 from holosplat.methods import FitOptions, GaussianRates
 from holosplat.methods.presets import preset

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import holosplat as hs
+from holosplat_bench.suite.families import Room
 from holosplat_bench.suite.methods import METHODS
-from holosplat_bench.suite.random_specimens import Room
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 MATERIAL = hs.DeltaBeta(1e-7, 1e-10)

@@ -11,7 +11,7 @@ import torch
 from helpers.contract import two_balls
 from helpers.once import Once, of, once
 from holosplat.baselines import HolographicTV
-from holosplat.fit.schedule import Schedule
+from holosplat.fit.problem import Schedule
 from holosplat.matter import MaterialPrior
 from holosplat.methods import FitOptions, Gaussians, Task
 from holosplat.methods.solve import solve

@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from holosplat.checks import InputError
 from holosplat.geometry import Views, rotation_tilted
+from holosplat.io.atomic import write_json
 from holosplat.io.beams import Beams, read_beams, write_beams
 from holosplat.io.formats import read, read_as, run_reading, run_source
-from holosplat.io.json import write_json
 from holosplat.io.nxtomo import write_scan
 from holosplat.io.reading import Part, Reading, Told
 from holosplat.scan import Exposures, Scan

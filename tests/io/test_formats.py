@@ -16,9 +16,9 @@ from holosplat import io
 from holosplat.checks import InputError
 from holosplat.geometry import Views, rotation_y
 from holosplat.io import formats
+from holosplat.io.atomic import write_json
 from holosplat.io.formats import loader_of
 from holosplat.io.images import write_tiff
-from holosplat.io.json import write_json
 from holosplat.io.nerf_synthetic import NerfOptions, write_nerf_synthetic, write_png
 from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.io.r2_gaussian import R2Options, write_r2_gaussian

@@ -16,8 +16,8 @@ from hypothesis.extra.numpy import arrays
 
 from helpers.strategies import NAMES, VIEWS, clouds, images, numbers, scans, vectors
 from holosplat.geometry import Grid, Views
+from holosplat.io.atomic import read_json, write_json
 from holosplat.io.images import read_tiff, write_tiff
-from holosplat.io.json import read_json, write_json
 from holosplat.io.nerf_synthetic import (
     LEVELS,
     NerfOptions,

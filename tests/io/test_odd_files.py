@@ -13,8 +13,7 @@ import tifffile
 from helpers.odd_files import ANGLES, FRAMES, SHAPE, N, a_scan, images, numbered, said
 from holosplat.checks import InputError, MissingError
 from holosplat.geometry import rotation_y
-from holosplat.io.angles import read_angles
-from holosplat.io.file_order import in_order
+from holosplat.io.angles import in_order, read_angles
 from holosplat.io.formats import read_as
 from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.io.reading import Reading, Told

@@ -11,9 +11,9 @@ import pytest
 
 from holosplat.checks import InputError
 from holosplat.geometry import Views, rotation_y
+from holosplat.io.atomic import write_json
 from holosplat.io.formats import read, read_as, run_reading, run_source
 from holosplat.io.images import write_tiff
-from holosplat.io.json import write_json
 from holosplat.io.nxtomo import write_scan
 from holosplat.io.reading import Part, Reading, Told, read_angles
 from holosplat.scan import Exposures, Scan

@@ -18,7 +18,7 @@ import holosplat.io.seal as module
 from holosplat.checks import InputError
 from holosplat.geometry import Views
 from holosplat.io import read_scan
-from holosplat.io.hdf5_writing import new_hdf5, put
+from holosplat.io.hdf5 import new_hdf5, put
 from holosplat.io.nxtomo import write_scan
 from holosplat.io.seal import ENDING, MAGIC, require_sealed, seal, summed
 from holosplat.scan import Exposures, Scan

@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from holosplat.learning.weights import SHIPPED, read_weights
-from holosplat.training.options import TrainOptions
-from holosplat.training.ranges import Ranges
+from holosplat.training.options import Ranges, TrainOptions
 from holosplat.training.sample import sample_of
 from holosplat.training.shown import dice, example_of_views
 

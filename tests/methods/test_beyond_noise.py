@@ -11,7 +11,7 @@ from torch import Tensor
 
 import holosplat as hs
 from holosplat.methods.cross_validation import MissingMatter
-from holosplat.optics.noise_model import NoiseModel
+from holosplat.optics.noise import NoiseModel
 
 MATERIAL = hs.DeltaBeta(2e-7, 2e-10)
 SHAPE = (27, 38)

@@ -12,7 +12,7 @@ from helpers.bumpy import DELTA, bumpy, poses, surfaces
 from holosplat.baselines import HolographicTV
 from holosplat.beamline.simulate import simulate
 from holosplat.fit.loop import Fit
-from holosplat.fit.schedule import Schedule
+from holosplat.fit.problem import Schedule
 from holosplat.geometry import Grid
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.matter import MaterialPrior

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from helpers.two_balls import BETA, DELTA, NETWORK, ONE, blurred_start, chords, error, misfit_of, scan, truth
 from holosplat.checks import InputError
-from holosplat.fit.schedule import Schedule
+from holosplat.fit.problem import Schedule
 from holosplat.fit.terms import Objective
 from holosplat.geometry import Grid
 from holosplat.matter import MaterialPrior, Matter

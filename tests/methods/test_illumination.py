@@ -16,7 +16,7 @@ from holosplat.geometry import Views
 from holosplat.inference import Score
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import Auto, SmoothVolume, Task
-from holosplat.methods.first_volumes import BY_FISSION, BY_VIEWS, FirstVolumes, Folds
+from holosplat.methods.cross_validation import BY_FISSION, BY_VIEWS, FirstVolumes, Folds
 from holosplat.methods.illumination import STAGE, prepared, shows_matter
 from holosplat.methods.levels import SHOWN
 from holosplat.methods.method import first_of_task

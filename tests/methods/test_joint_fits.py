@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from helpers.fit_balls import MATERIAL, PIXEL, RATES
 from holosplat.fit.loop import Fit
-from holosplat.fit.schedule import Schedule
+from holosplat.fit.problem import Schedule
 from holosplat.fit.terms import Objective
 from holosplat.geometry import Views
 from holosplat.matter import Matter

@@ -10,7 +10,7 @@ from holosplat.beamline.simulate import simulate
 from holosplat.geometry import Views
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import Auto, Task
-from holosplat.methods.first_volumes import BY_VIEWS
+from holosplat.methods.cross_validation import BY_VIEWS
 from holosplat.methods.kinds import decide_kind, unseen_kinds
 from holosplat.representations import GaussianCloud, SurfaceMesh
 from holosplat.scan import Exposures

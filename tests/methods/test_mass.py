@@ -13,7 +13,7 @@ from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta, Matter
 from holosplat.methods.modulation import MODEL_SHARE, RATIO_SHARE, total_delta
-from holosplat.optics.noise_model import NoiseModel
+from holosplat.optics.noise import NoiseModel
 from holosplat.representations import VoxelGrid
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.soft_matter import soft_cells

@@ -12,7 +12,7 @@ from helpers.two_balls import NETWORK, ONE, scan
 from helpers.two_balls import truth as true_volume
 from holosplat.baselines import HolographicTV
 from holosplat.checks import InputError
-from holosplat.fit.schedule import Schedule
+from holosplat.fit.problem import Schedule
 from holosplat.geometry import Grid
 from holosplat.matter import MaterialPrior
 from holosplat.methods import (

@@ -12,7 +12,7 @@ from holosplat.fit.smooth_volume import ContinuousPrior, VolumeProblem
 from holosplat.fit.whitened import WhitenedFrames
 from holosplat.geometry import Grid
 from holosplat.methods.modulation import Ranges, Told, best, modulated, modulations, unshrunk
-from holosplat.optics.noise_model import NoiseModel
+from holosplat.optics.noise import NoiseModel
 from holosplat.scan import Scan
 
 SIGMA = 0.04

@@ -12,7 +12,7 @@ from helpers.bumpy import bumpy, surfaces
 from helpers.noisy_cells import MATTER, PITCH, error, mesh_of, task_of
 from holosplat.baselines import HolographicTV, holographic_tv
 from holosplat.checks import InputError
-from holosplat.fit.schedule import Schedule
+from holosplat.fit.problem import Schedule
 from holosplat.methods import Gaussians, SurfaceOptions, Surfaces, Task
 from holosplat.methods.coarse import CoarseToFine, Way, begun_surfaces, first_of, missing_matter
 from holosplat.methods.first_surfaces import first_surfaces, is_noisy, surfaces_of_volume

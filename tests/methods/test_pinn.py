@@ -21,9 +21,8 @@ from holosplat.methods.pinn import FLOW_ALONE, THROUGH_WAVES
 from holosplat.methods.presets import method_called
 from holosplat.representations import SpaceTime, SpaceTimeField
 from holosplat.scan import Exposures, Scan
-from holosplat.specimens.mesh_series import MeshSeries
 from holosplat.specimens.red_cells import icosphere
-from holosplat.specimens.scene import MeshScene
+from holosplat.specimens.scene import MeshScene, MeshSeries
 from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
 from holosplat.workflows.run_folder import RunFolder
 

@@ -16,8 +16,8 @@ from helpers.fit_balls import a_cloud, a_scan, fit_of
 from helpers.two_balls import NETWORK, ONE, blurred_start, chords, scan
 from holosplat.fit.density import DensityControl
 from holosplat.fit.loop import Fit
+from holosplat.fit.problem import Schedule
 from holosplat.fit.run import Record
-from holosplat.fit.schedule import Schedule
 from holosplat.fit.terms import Objective
 from holosplat.geometry import Grid
 from holosplat.matter import MaterialPrior

@@ -18,7 +18,7 @@ from helpers.poses import relative
 from holosplat.beamline.simulate import simulate
 from holosplat.fit.loop import Fit
 from holosplat.fit.pose_refinement import PoseRefinement
-from holosplat.fit.schedule import Schedule
+from holosplat.fit.problem import Schedule
 from holosplat.fit.terms.object import Neighbours, membrane_inverse, squared_product
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.methods import Auto, SurfaceFit, Surfaces, finished

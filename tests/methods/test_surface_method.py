@@ -13,7 +13,7 @@ from helpers.bumpy import DELTA, area, bumpy, poses, surfaces
 from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
 from holosplat.fit.loop import Fit
-from holosplat.fit.schedule import Schedule
+from holosplat.fit.problem import Schedule
 from holosplat.fit.terms import Objective
 from holosplat.geometry import Grid
 from holosplat.materials import HAEMOGLOBIN

@@ -12,7 +12,7 @@ from helpers.noisy_cells import MATTER, PITCH, error, mesh_of, occupancy, task_o
 from holosplat.baselines import HolographicTV
 from holosplat.baselines.holographic_tv import agreed
 from holosplat.checks import InputError
-from holosplat.fit.schedule import Schedule
+from holosplat.fit.problem import Schedule
 from holosplat.geometry import Grid
 from holosplat.methods import Gaussians, SurfaceOptions, Task
 from holosplat.methods.coarse import CoarseToFine

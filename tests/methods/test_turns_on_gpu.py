@@ -8,7 +8,7 @@ from helpers.noisy_cells import error, mesh_of, occupancy, task_of
 from helpers.pretended_gpu import pretended_gpu
 from holosplat.backends import Backend
 from holosplat.baselines import HolographicTV
-from holosplat.fit.schedule import Schedule
+from holosplat.fit.problem import Schedule
 from holosplat.methods import Gaussians, SurfaceOptions
 from holosplat.methods.coarse import CoarseToFine, missing_matter
 from holosplat.methods.first_surfaces import in_turns

@@ -24,7 +24,7 @@ from holosplat.methods.modulation import modulated, unshrunk
 from holosplat.methods.smooth_fit import SmoothFit
 from holosplat.methods.volume import SmoothStage, binning
 from holosplat.optics.background import Light, LightOptions
-from holosplat.optics.noise_model import NoiseModel
+from holosplat.optics.noise import NoiseModel
 from holosplat.representations import VoxelGrid
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.soft_matter import round_cell, tissue

@@ -19,7 +19,7 @@ from holosplat.methods.method import Task
 from holosplat.methods.window import MARGIN, MULTIPLE, Windows, shown, windows_of
 from holosplat.model import measure
 from holosplat.optics.background import LightOptions
-from holosplat.optics.noise_model import NoiseModel
+from holosplat.optics.noise import NoiseModel
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.phantoms import Ball
 from holosplat.specimens.scene import MeshScene

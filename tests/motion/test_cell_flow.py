@@ -19,7 +19,7 @@ from holosplat.motion.membrane_fit import CellFlow, Unknowns, advanced
 from holosplat.specimens.flow.channel import Channel
 from holosplat.specimens.flow.suspension import Medium
 from holosplat.specimens.membrane.model import Elasticity, Membrane
-from holosplat.specimens.membrane.resting import geodesic_sphere
+from holosplat.specimens.membrane.rest import geodesic_sphere
 from holosplat.specimens.red_cells import RedCell, icosphere
 
 FRAME = ChannelFrame((22e-6, 17e-6))

@@ -13,8 +13,8 @@ import holosplat as hs
 from helpers.kept import Kept
 from holosplat.bodies.rest_shape import centroid
 from holosplat.checks import InputError
+from holosplat.fit.problem import Schedule
 from holosplat.fit.run import Run
-from holosplat.fit.schedule import Schedule
 from holosplat.matter import Matter
 from holosplat.mesh import TriangleMesh, across, normals
 from holosplat.metrics.volumes import normal_distance

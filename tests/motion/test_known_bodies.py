@@ -20,8 +20,8 @@ from holosplat.motion.elastic import Elastic, RestShapeKept, strain_energy
 from holosplat.motion.known import drift, poses_like
 from holosplat.motion.track import TrackOptions, follow
 from holosplat.representations import MovingSurfaces, TimeBasis
-from holosplat.specimens.mesh_series import MeshSeries
 from holosplat.specimens.red_cells import icosphere
+from holosplat.specimens.scene import MeshSeries
 
 
 def test_strain_costs_nothing_at_rest_in_any_pose_and_of_any_size():

@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from holosplat.checks import InputError
 from holosplat.motion.particles import Particle, ParticleOptions, find_particles, link_particles
 from holosplat.optics.resampling import InLine, refocused, register
-from holosplat.preprocess.flat_field import fixed_background
+from holosplat.preprocess.pixels import fixed_background
 
 WAVELENGTH, PIXEL = 0.6328e-6, 10e-6
 SHAPE, FINER = (97, 131), 2

@@ -12,7 +12,7 @@ import torch
 from helpers.kept import Kept
 from helpers.moving_ellipsoids import MATERIAL, PIXEL, TIMES, scan, true_paths
 from holosplat.fit import run as engine
-from holosplat.fit.schedule import Schedule
+from holosplat.fit.problem import Schedule
 from holosplat.motion import body_tracker
 from holosplat.motion import fit as path_fits
 from holosplat.motion.fit import PathOptions, motion_fit

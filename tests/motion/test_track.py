@@ -12,7 +12,7 @@ import torch
 from helpers.moving_ellipsoids import BODIES, MATERIAL, PIXEL, STEP, TIMES, scan, true_paths, truth
 from holosplat.bodies.rest_shape import centroid
 from holosplat.checks import InputError
-from holosplat.fit.schedule import Schedule
+from holosplat.fit.problem import Schedule
 from holosplat.geometry import Grid
 from holosplat.matter import Matter
 from holosplat.metrics import volume_scores

@@ -13,8 +13,8 @@ import holosplat as hs
 from helpers.motion_shadows import OTHER, TURN, cell
 from holosplat.bodies.poses import map_near, twin_map, twin_of
 from holosplat.bodies.rest_shape import moments
+from holosplat.fit.problem import Schedule
 from holosplat.fit.run import Run
-from holosplat.fit.schedule import Schedule
 from holosplat.geometry import rotation_y
 from holosplat.inference import Score
 from holosplat.materials import HAEMOGLOBIN

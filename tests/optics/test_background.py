@@ -15,7 +15,7 @@ from holosplat.geometry import Views
 from holosplat.matter import DeltaBeta
 from holosplat.model import SolvedLight
 from holosplat.optics.background import Background, Light, LightOptions
-from holosplat.optics.noise_model import NoiseModel
+from holosplat.optics.noise import NoiseModel
 from holosplat.scan import Exposures
 from holosplat.specimens.soft_matter import round_cell
 

@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 
 from holosplat.checks import InputError
 from holosplat.optics.air import air_in_boxes, find_air, has_air
-from holosplat.optics.noise_model import NoiseModel
+from holosplat.optics.noise import NoiseModel
 
 SHAPES = [(4, 96, 96), (4, 81, 117)]
 

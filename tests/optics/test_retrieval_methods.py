@@ -45,14 +45,20 @@ from holosplat.optics.retrieval import (
     bounded_estimate,
     gerchberg_saxton,
     hybrid_input_output,
-    iterative,
+    nonlinear,
     paganin,
     tikhonov,
 )
-from holosplat.optics.retrieval.admm import _laplacian, gradient, gradient_adjoint
-from holosplat.optics.retrieval.iterative import through_detector
 from holosplat.optics.retrieval.model import WaveModel
-from holosplat.optics.retrieval.nonlinear import descend, objective, penalty_weights
+from holosplat.optics.retrieval.nonlinear import (
+    _laplacian,
+    descend,
+    gradient,
+    gradient_adjoint,
+    objective,
+    penalty_weights,
+    through_detector,
+)
 from holosplat.scan import Exposures
 
 
@@ -147,7 +153,7 @@ def test_projection_on_one_material(monkeypatch):
     """Where only the amplitude is found wrong, by `exp(-r Δ)`, the nearest phase is `φ + r² Δ / (1 + r²)`."""
     waves, ratio, change = model_of(ratio=0.5), 0.5, 0.2
     gain = torch.full(waves.phase.shape, math.exp(-ratio * change), dtype=DOUBLE)
-    monkeypatch.setattr(iterative, "_gain", lambda model, phase: gain)
+    monkeypatch.setattr(nonlinear, "_gain", lambda model, phase: gain)
     phase = torch.full_like(waves.phase, 3.0)
     expected = 3.0 + ratio**2 * change / (1 + ratio**2)
     assert torch.allclose(through_detector(waves, phase), torch.full_like(phase, expected), atol=1e-12)

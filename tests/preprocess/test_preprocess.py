@@ -19,7 +19,7 @@ from holosplat.preprocess import (
     unlit,
 )
 from holosplat.preprocess.eigen_flats import _binned, _effective
-from holosplat.preprocess.flat_field import mean_frame
+from holosplat.preprocess.pixels import mean_frame
 
 H, W = 53, 70
 

@@ -15,7 +15,7 @@ import pytest
 from helpers.cli import holosplat, refused, worked
 from helpers.series import planned
 from holosplat.checks import InputError, MissingError
-from holosplat.io.json import write_json
+from holosplat.io.atomic import write_json
 from holosplat.series import run as running
 from holosplat.series.folder import FAILED, SeriesFolder
 from holosplat.series.plan import Slurm

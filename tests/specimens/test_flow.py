@@ -21,7 +21,7 @@ from holosplat.specimens.flow.suspension import (
     stokeslet_velocity,
 )
 from holosplat.specimens.membrane.model import Membrane
-from holosplat.specimens.membrane.resting import geodesic_sphere, resting_cell
+from holosplat.specimens.membrane.rest import geodesic_sphere, resting_cell
 
 BOXES = ((80e-6, 34e-6, 26e-6), (50e-6, 17e-6, 31e-6), (20e-6, 20e-6, 20e-6))
 MIDDLE = torch.tensor([40e-6, 17e-6, 13e-6], dtype=torch.float64)

@@ -13,8 +13,14 @@ from holosplat.checks import InputError
 from holosplat.mesh import TriangleMesh
 from holosplat.specimens.membrane import model
 from holosplat.specimens.membrane.model import Elasticity, Membrane, stretch
-from holosplat.specimens.membrane.rest import RestShape, elongation, gyration_axes, shape_change
-from holosplat.specimens.membrane.resting import geodesic_sphere, resting_cell
+from holosplat.specimens.membrane.rest import (
+    RestShape,
+    elongation,
+    geodesic_sphere,
+    gyration_axes,
+    resting_cell,
+    shape_change,
+)
 from holosplat.specimens.red_cells import RedCell, icosphere
 
 NOTHING = Elasticity(**{field.name: 0.0 for field in fields(Elasticity)})

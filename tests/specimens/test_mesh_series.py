@@ -16,9 +16,8 @@ from holosplat.io.pvd import find_snapshots
 from holosplat.io.vtk import read_meshes, write_mesh
 from holosplat.materials import DeltaBeta
 from holosplat.mesh import TriangleMesh
-from holosplat.specimens.mesh_series import MeshSeries
 from holosplat.specimens.red_cells import icosphere
-from holosplat.specimens.scene import MeshScene
+from holosplat.specimens.scene import MeshScene, MeshSeries
 from holosplat.volume import Object
 
 GLASS = DeltaBeta(1e-6, 1e-9)

@@ -12,15 +12,14 @@ import torch
 from helpers.ball_sample import ball_sample
 from helpers.two_balls import ONE, scan, truth
 from holosplat.checks import InputError
-from holosplat.fit.schedule import Schedule
+from holosplat.fit.problem import Schedule
 from holosplat.learning.weights import Card, read_aligned, write_aligned, write_weights
 from holosplat.matter import MaterialPrior
 from holosplat.methods import AlignedFit, Onix, PixelNerf, Task, solve
 from holosplat.representations import AlignedNetwork, PixelAligned, PixelAlignedField
 from holosplat.training.aligned import AlignedTraining, AlignedValidation, Critic, draw_aligned_example, first_views
 from holosplat.training.folder import Dataset
-from holosplat.training.options import FrameLossWeights, TrainOptions, ViewSampling
-from holosplat.training.ranges import Ranges
+from holosplat.training.options import FrameLossWeights, Ranges, TrainOptions, ViewSampling
 from holosplat.training.sample import Sample
 
 SMALL = AlignedNetwork((4, 6), 8, 2)

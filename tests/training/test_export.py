@@ -14,7 +14,7 @@ from holosplat.checks import InputError
 from holosplat.geometry import rotation_tilted
 from holosplat.training.export import export
 from holosplat.training.folder import Dataset
-from holosplat.training.ranges import Ranges
+from holosplat.training.options import Ranges
 from holosplat.training.sample import Sample, as_scan
 
 ANGLES = (0.0, 70.0, 110.0)

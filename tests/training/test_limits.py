@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from holosplat.training.ranges import Ranges
+from holosplat.training.options import Ranges
 from holosplat.training.train import limits
 
 SCORES = {"2": {"dice": 0.514, "scenes": 7.0}, "3": {"dice": 0.4, "scenes": 7.0}}

@@ -11,7 +11,7 @@ from torch.nn.functional import avg_pool2d
 from holosplat.checks import InputError
 from holosplat.learning.network import FINE, coarse, thickness_of
 from holosplat.training.folder import Dataset, write_datasheet
-from holosplat.training.ranges import Ranges
+from holosplat.training.options import Ranges
 from holosplat.training.sample import Sample, draw_scene, sample_of
 from holosplat.training.shown import make_example
 

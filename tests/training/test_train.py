@@ -16,8 +16,7 @@ from holosplat.geometry import rotation_y
 from holosplat.learning.network import Size
 from holosplat.learning.weights import read_weights
 from holosplat.training.folder import Dataset
-from holosplat.training.options import LossWeights, TrainOptions, ViewSampling
-from holosplat.training.ranges import Ranges
+from holosplat.training.options import LossWeights, Ranges, TrainOptions, ViewSampling
 from holosplat.training.sample import Sample
 from holosplat.training.shown import Validation, dice, example_of_views, loss, soft_dice
 from holosplat.training.train import Training

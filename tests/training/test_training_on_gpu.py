@@ -20,8 +20,7 @@ from holosplat.learning.weights import read_aligned, read_weights
 from holosplat.representations import AlignedNetwork
 from holosplat.training.aligned import AlignedTraining, AlignedValidation
 from holosplat.training.folder import Dataset
-from holosplat.training.options import FrameLossWeights, TrainOptions, ViewSampling
-from holosplat.training.ranges import Ranges
+from holosplat.training.options import FrameLossWeights, Ranges, TrainOptions, ViewSampling
 from holosplat.training.sample import Sample
 from holosplat.training.shown import Validation
 from holosplat.training.train import Training

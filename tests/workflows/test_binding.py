@@ -16,8 +16,8 @@ from helpers.runs import KNOWN, RANDOM, Interruption
 from holosplat.checks import InputError
 from holosplat.fit import run as engine
 from holosplat.geometry import Grid
-from holosplat.io.hdf5_writing import new_hdf5
-from holosplat.io.json import read_json, write_json
+from holosplat.io.atomic import read_json, write_json
+from holosplat.io.hdf5 import new_hdf5
 from holosplat.io.light import write_light
 from holosplat.io.objects import write_object
 from holosplat.materials import parse_material

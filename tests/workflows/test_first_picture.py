@@ -14,7 +14,7 @@ from holosplat.checks import InputError
 from holosplat.geometry import Views
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.matter import MaterialPrior
-from holosplat.methods.first_volumes import first_picture
+from holosplat.methods.cross_validation import first_picture
 from holosplat.progress import PICTURE
 from holosplat.representations import VoxelGrid
 from holosplat.scan import Exposures, Scan

@@ -18,7 +18,7 @@ from holosplat.cli.retrieve import _preview
 from holosplat.geometry import Views
 from holosplat.io import write_scan
 from holosplat.io.atomic import atomic_folder, atomic_path
-from holosplat.io.hdf5_writing import new_hdf5, put, require_room
+from holosplat.io.hdf5 import new_hdf5, put, require_room
 from holosplat.scan import Exposures, Scan
 from holosplat.workflows.run_folder import RunFolder
 

@@ -13,7 +13,7 @@ from helpers.soft import two_cells
 from holosplat.checks import InputError
 from holosplat.geometry import Grid
 from holosplat.inference import Compared, Decision
-from holosplat.io.json import read_json
+from holosplat.io.atomic import read_json
 from holosplat.matter import MaterialPrior
 from holosplat.methods import GaussianRates, SmoothVolume, solve
 from holosplat.methods.keeper import Keeper

@@ -12,8 +12,7 @@ from holosplat.matter import DeltaBeta, Matter
 from holosplat.representations import GaussianCloud, MovingSurfaces, TimeBasis, VoxelGrid
 from holosplat.representations.gaussians import raw_of
 from holosplat.specimens.red_cells import icosphere
-from holosplat.workflows.run_folder import RunFolder
-from holosplat.workflows.run_status import RunStatus, read_status
+from holosplat.workflows.run_folder import RunFolder, RunStatus, read_status
 
 MATTER = Matter((DeltaBeta(4e-7, 2e-10),))
 

@@ -17,7 +17,7 @@ import pytest
 from holosplat.checks import InputError
 from holosplat.io import lock
 from holosplat.io.atomic import atomic_folder, atomic_path, is_taken
-from holosplat.io.hdf5_writing import new_hdf5, put
+from holosplat.io.hdf5 import new_hdf5, put
 from holosplat.io.leftovers import LOCK, host, temporary_name
 from holosplat.io.lock import sole_writer
 from holosplat.workflows.provenance import MANIFEST, faults

@@ -14,7 +14,7 @@ from helpers.runs import CELL, KNOWN, PIXEL, RANDOM, SHAPE, SMALL, Interruption,
 from holosplat import native
 from holosplat.baselines import HolographicTV
 from holosplat.checks import InputError
-from holosplat.fit.schedule import Schedule
+from holosplat.fit.problem import Schedule
 from holosplat.fit.terms import Objective
 from holosplat.geometry import Grid, Views
 from holosplat.matter import MaterialPrior, Matter

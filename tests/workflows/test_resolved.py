@@ -10,7 +10,7 @@ import pytest
 
 from holosplat.baselines import HolographicTV
 from holosplat.beamline.simulate import simulate
-from holosplat.fit.schedule import Schedule
+from holosplat.fit.problem import Schedule
 from holosplat.geometry import Views
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import Gaussians

@@ -11,7 +11,7 @@ import torch
 
 from holosplat.checks import InputError
 from holosplat.geometry import Grid
-from holosplat.io.json import write_json
+from holosplat.io.atomic import write_json
 from holosplat.io.objects import write_object
 from holosplat.matter import Matter
 from holosplat.representations import VoxelGrid

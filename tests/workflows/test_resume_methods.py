@@ -18,7 +18,7 @@ from helpers.unjudged import unjudged
 from holosplat.baselines import HolographicTV
 from holosplat.beamline.simulate import simulate
 from holosplat.fit import run as engine
-from holosplat.fit.schedule import Schedule
+from holosplat.fit.problem import Schedule
 from holosplat.fit.terms import Objective
 from holosplat.geometry import Views
 from holosplat.io.objects import read_object

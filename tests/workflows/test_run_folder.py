@@ -18,7 +18,7 @@ from helpers.runs import CELL, KNOWN, PIXEL, RANDOM, SMALL, STEPS, Interruption
 from holosplat.checks import InputError
 from holosplat.fit import run as engine
 from holosplat.fit.optimiser import Adam
-from holosplat.fit.schedule import Schedule
+from holosplat.fit.problem import Schedule
 from holosplat.matter import DeltaBeta, MaterialPrior, Matter
 from holosplat.methods import FitOptions, GaussianRates, Gaussians
 from holosplat.methods.presets import read_method

@@ -13,7 +13,7 @@ from holosplat.baselines import HolographicTV
 from holosplat.beamline.light import correlated_field
 from holosplat.beamline.simulate import simulate
 from holosplat.geometry import Grid, Views
-from holosplat.io.json import read_json
+from holosplat.io.atomic import read_json
 from holosplat.matter import DeltaBeta, MaterialPrior, Matter
 from holosplat.methods import HolographicVoxels
 from holosplat.methods.per_view import PerView

@@ -16,7 +16,7 @@ from helpers import two_balls
 from helpers.pretended_gpu import OnGpu, pretended_gpu
 from holosplat.align.poses import PoseOptions
 from holosplat.baselines import HolographicTV
-from holosplat.fit.schedule import Schedule
+from holosplat.fit.problem import Schedule
 from holosplat.matter import DeltaBeta, MaterialPrior, Matter
 from holosplat.methods import Auto, FitOptions, Gaussians, Method, solve
 from holosplat.methods.coarse import on_pixels

@@ -13,8 +13,8 @@ from helpers.contact import contact_scan
 from helpers.runs import CELL, KNOWN, SMALL, scene
 from holosplat.baselines import HolographicTV
 from holosplat.checks import InputError
+from holosplat.fit.problem import Schedule
 from holosplat.fit.residuals import Prediction
-from holosplat.fit.schedule import Schedule
 from holosplat.geometry import Grid
 from holosplat.matter import MaterialPrior, Matter
 from holosplat.methods import (

@@ -19,10 +19,8 @@ from ..optics.sampling import fringe_sampling
 from ..progress import Progress
 from ..ranges import Pixels, checked_dataclass
 from ..scan import Exposures, Scan
-from .changes import changes, header, line, moved_onto
-from .derivatives import NUMBERS
+from .derivatives import NUMBERS, changes, header, line, moved_onto, unexplained
 from .initial_geometry import shifts_by_mass
-from .newton import unexplained
 from .phantom import STEPS, Linear, Phantom, find_beads, linearised, placed, solved
 from .poses import DISTANCE, FLUX, SHIFT, TURN, PosePrior
 from .shadows import EVEN_OR_NOT, in_even_light

@@ -1,11 +1,14 @@
-"""How frames change with the pose of their view: exact derivatives of projections, carried through the wave optics."""
+"""How frames change with the pose of their view: exact derivatives of projections, carried through the wave optics; a
+damped Gauss–Newton step by them; the changes of views as words and tables."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.nn.functional import interpolate
 
@@ -13,6 +16,7 @@ from ..baselines.wave_frames import frames_of
 from ..geometry import Grid, Views
 from ..matter import DeltaBeta
 from ..model import Instrument
+from ..optics.noise import left_of
 from ..projectors.voxels import LatticeProjector
 from ..scan import Exposures
 
@@ -103,3 +107,136 @@ def slopes(images: Tensor) -> tuple[Tensor, Tensor]:
 def in_pixels(views: Views) -> Views:
     """The same views with the pitch as the unit of length."""
     return views.in_units_of(views.pitch)
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Information of frames on K parameters of each of V views, near the present ones; frames of a view add up.
+
+    information: [V, K, K], the Hessian of half the squared residuals over their noise
+    slope: [V, K], how fast these fall along each number
+    """
+
+    information: Tensor
+    slope: Tensor
+
+    @classmethod
+    def of(cls, measured: Tensor, found: Predicted, blur: float) -> Normal:
+        """measured: frames [V, H, W], NaN in pixels without a value; found: at the present numbers, flux included;
+        blur: standard deviation of a Gaussian [pixels] by which images are compared. The noise of a view is what it
+        leaves unexplained, as it is after that blur: this many independent pixels."""
+        known = ~measured.isnan()
+        missing = blurred(left_of(measured, found.frames), blur).flatten(1).double()
+        columns = blurred(found.derivatives * known[:, None], blur).flatten(2).double()
+        independent = 1 / (4 * math.pi * blur**2)
+        scale = independent / (missing.square().sum(1) / known.sum((1, 2))).clamp_min(1e-18)
+        information = torch.einsum("vip,vjp->vij", columns, columns) * scale[:, None, None]
+        return cls(information, torch.einsum("vip,vp->vi", columns, missing) * scale[:, None])
+
+    def in_units(self, scales: Tensor) -> Normal:
+        """The same for numbers `scales` [K] times larger."""
+        return Normal(self.information / (scales[:, None] * scales), self.slope / scales)
+
+
+@dataclass(frozen=True)
+class Step:
+    """numbers: [V, K] after the step; covariances: [V, K, K] of them, by frames and prior, for a known volume."""
+
+    numbers: Tensor
+    covariances: Tensor
+
+
+def step(normal: Normal, numbers: Tensor, expected: Tensor) -> Step:
+    """The likeliest numbers near the present ones (Levenberg 1944, with the prior as damping); float64.
+
+    numbers: [V, K]; expected: [K] standard deviations of the numbers about zero, 0 for those that stay.
+    """
+    free = expected > 0
+    information, slope = normal.information[:, free][:, :, free], normal.slope[:, free]
+    prior = expected[free] ** -2
+    covariances = torch.linalg.inv(information + torch.diag(prior))
+    moved = torch.einsum("vij,vj->vi", covariances, slope - prior * numbers[:, free])
+    after = numbers.clone()
+    after[:, free] += moved
+    whole = torch.zeros(*numbers.shape, numbers.shape[1], dtype=numbers.dtype)
+    places = torch.nonzero(free)[:, 0]
+    whole[:, places[:, None], places] = covariances
+    return Step(after, whole)
+
+
+def blurred(images: Tensor, sigma: float) -> Tensor:
+    """Images [..., H, W] convolved with a Gaussian of `sigma` [pixels], periodically."""
+    h, w = images.shape[-2:]
+    squares = torch.fft.fftfreq(h)[:, None] ** 2 + torch.fft.rfftfreq(w) ** 2
+    return torch.fft.irfft2(torch.fft.rfft2(images) * torch.exp(-2 * math.pi**2 * sigma**2 * squares), s=(h, w))
+
+
+def unexplained(measured: Tensor, images: Tensor) -> Tensor:
+    """[V, H, W] what images leave of frames, over each frame's contrast; 0 in pixels of these that are NaN."""
+    return left_of(measured, images) / contrast_of(measured)
+
+
+def contrast_of(measured: Tensor) -> Tensor:
+    """[V, 1, 1] standard deviation of frames [V, H, W] in pixels that are not NaN."""
+    away = (measured - measured.nanmean(dim=(1, 2), keepdim=True)).square().nansum(dim=(1, 2), keepdim=True)
+    return (away / ((~measured.isnan()).sum(dim=(1, 2), keepdim=True) - 1)).sqrt().clamp_min(1e-12)
+
+
+def rms_of(images: Tensor) -> np.ndarray:
+    """[V] root mean squares of images [V, H, W]."""
+    return images.double().square().mean((1, 2)).sqrt().numpy()
+
+
+def numbers_of(found: Exposures, planned: Exposures) -> Tensor:
+    """[V, 7] shifts [pixels], turns [rad], and logarithms of distance and magnification, that make `planned` exposures
+    `found`."""
+    turns = np.einsum("vij,vkj->vik", found.views.rotations, planned.views.rotations)
+    shifts = (found.views.shifts - planned.views.shifts) / planned.views.pixel_sizes[:, None]
+    near = np.where(planned.distance > 0, found.distance / np.where(planned.distance > 0, planned.distance, 1), 1)
+    vectors = Rotation.from_matrix(turns).as_rotvec()
+    larger = np.log(planned.views.pixel_sizes / found.views.pixel_sizes)
+    return torch.from_numpy(np.concatenate([shifts, vectors, np.log(near)[:, None], larger[:, None]], axis=1))
+
+
+def changes(found: Exposures, planned: Exposures) -> np.ndarray:
+    """[V, 7]: shifts x, y [pixels], turns about x, y, z of the lab [degrees], shares of distance and magnification."""
+    numbers = numbers_of(found, planned).numpy()
+    return np.concatenate([numbers[:, :2], np.rad2deg(numbers[:, 2:5]), np.expm1(numbers[:, 5:])], axis=1)
+
+
+def in_words(of_views: np.ndarray) -> str:
+    """Root mean squares of `changes` [V, 7], without the magnification's."""
+    root = np.sqrt(np.square(of_views).mean(0))
+    across = np.hypot(root[[0, 2]], root[[1, 3]]) / np.sqrt(2)
+    return (
+        f"changes of the plan (rms): shifts {across[0]:.3f} pixels, turns across the beam {across[1]:.3f}°, "
+        f"roll {root[4]:.3f}°, distance {root[5]:.2%}"
+    )
+
+
+def header(what: str, digits: int, *last: str) -> str:
+    """The first line of a table of changes whose lines are those of `line`; what: `view` or `beam`."""
+    shift, turn = 2 * digits + 9, 2 * digits + 11  # the width of the cells of a line
+    cells = [f"shift {axis}".ljust(shift) for axis in "xy"] + [f"turn {axis}".ljust(turn) for axis in "xy"]
+    return "  ".join([what, *cells, *("roll".ljust(turn), *last)]).rstrip()
+
+
+def line(number: int, change: np.ndarray, error: np.ndarray, digits: int, *last: str) -> str:
+    """A line of a table: shifts with so many `digits`, turns with one more, each with its standard error."""
+    shifts = [f"{change[k]:+{digits + 4}.{digits}f} ± {error[k]:.{digits}f}" for k in (0, 1)]
+    turns = [f"{change[k]:+{digits + 4}.{digits + 1}f}° ± {error[k]:.{digits + 1}f}" for k in (2, 3, 4)]
+    return "  ".join([f"{number:4d}", *shifts, *turns, *last])
+
+
+def moved_onto(found: Views, planned: Views) -> Views:
+    """`found` with the object turned and moved so that its views are as near to `planned` as can be.
+
+    The common turn is the mean of all relative ones, the common motion the least-squares one: mean turn and mean shift
+    of the views are then zero. Frames stay what they are.
+    """
+    turns = np.einsum("vji,vjk->vik", found.rotations, planned.rotations)
+    rotations = found.rotations @ Rotation.from_matrix(turns).mean().as_matrix()
+    design = rotations[:, :2].reshape(-1, 3)
+    away = (found.shifts - planned.shifts).reshape(-1)
+    motion = np.linalg.lstsq(design, away, rcond=1e-9)[0]
+    return replace(found, rotations=rotations, shifts=found.shifts - (design @ motion).reshape(-1, 2))

@@ -16,9 +16,8 @@ from ..model import Alignment
 from ..optics.background import LightOptions
 from ..progress import Advance, Progress
 from ..scan import Exposures, Scan
-from .changes import changes, header, in_words, line, moved_onto
 from .consistency import Estimate
-from .derivatives import NUMBERS
+from .derivatives import NUMBERS, changes, header, in_words, line, moved_onto
 from .initial_geometry import SIDES, Images, RowGeometry, geometry_from_rows
 from .poses import DISTANCE, FLUX, SHIFT, TURN, Drift, Level, PoseOptions, PoseSearch
 from .row_sums import plane_angles

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ..checks import InputError
 from ..fit.pose_refinement import PoseRefinement, mean_distance_error
-from ..fit.schedule import Schedule
+from ..fit.problem import Schedule
 from ..geometry import Grid
 from ..matter import DeltaBeta, Matter
 from ..methods.surface_fit import SurfaceFit, oversampling, surface_fit
@@ -24,9 +24,7 @@ from ..model import Alignment, Instrument, Model
 from ..progress import Advance
 from ..representations import Stored, SurfaceMesh, isosurface
 from ..scan import Exposures, Scan
-from .changes import numbers_of
-from .derivatives import NUMBERS, Predicted
-from .newton import Normal, Step, step, unexplained
+from .derivatives import NUMBERS, Normal, Predicted, Step, numbers_of, step, unexplained
 from .poses import DISTANCE, FLUX, PoseOptions
 
 SMALL = (0.05, 0.05, 1e-3, 1e-3, 1e-3, 0.01, 1e-3)

@@ -15,11 +15,9 @@ from ..optics.sampling import fringe_sampling
 from ..progress import Progress
 from ..representations import Stored
 from ..scan import Scan
-from .changes import changes, numbers_of
-from .derivatives import NUMBERS, in_pixels
+from .derivatives import NUMBERS, changes, in_pixels, numbers_of, rms_of, unexplained
 from .fixed_matter import Beside
 from .initial_geometry import centres_of_mass
-from .newton import rms_of, unexplained
 from .poses import DISTANCE, FLUX, SHIFT, PoseOptions, PoseSearch
 from .views import AlignedViews, errors_of
 

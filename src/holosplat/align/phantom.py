@@ -24,9 +24,8 @@ from ..representations import SurfaceMesh
 from ..scan import Exposures
 from ..specimens.red_cells import icosphere
 from ..volume import LineIntegrals
-from .derivatives import NUMBERS, in_pixels
+from .derivatives import NUMBERS, blurred, in_pixels
 from .initial_geometry import centres_of_mass, shifts_by_mass
-from .newton import blurred
 
 FINENESS = 3
 """Bisections of an icosahedron that stands for a bead: 1280 triangles, off a ball by 0.4 % of the radius."""

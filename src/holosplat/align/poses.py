@@ -22,9 +22,8 @@ from ..progress import Advance
 from ..projectors.voxels import LatticeProjector
 from ..ranges import Angle, Pixels, Weight, checked_dataclass
 from ..scan import Exposures, Scan
-from .derivatives import NUMBERS, in_pixels, predicted
+from .derivatives import NUMBERS, Normal, in_pixels, predicted, step, unexplained
 from .initial_geometry import shifts_by_mass
-from .newton import Normal, step, unexplained
 
 SHIFT, TURN, DISTANCE, MAGNIFICATION, FLUX = slice(0, 2), slice(2, 5), 5, 6, 7
 """Places of the numbers of `NUMBERS`."""

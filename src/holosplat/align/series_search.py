@@ -12,8 +12,7 @@ from ..checks import require
 from ..matter import DeltaBeta
 from ..progress import Advance
 from ..scan import Exposures, Scan
-from .derivatives import NUMBERS
-from .newton import Normal, step
+from .derivatives import NUMBERS, Normal, step
 from .poses import DISTANCE, MAGNIFICATION, TURNING, Level, PoseOptions, PoseSearch
 
 ALIKE = 1e-6

@@ -23,12 +23,10 @@ from ..progress import Progress
 from ..projectors.voxels import LatticeProjector
 from ..representations import SurfaceMesh
 from ..scan import Exposures, Scan
-from .changes import changes, header, in_words, line, moved_onto, numbers_of
-from .derivatives import in_pixels, predicted
+from .derivatives import changes, header, in_pixels, in_words, line, moved_onto, numbers_of, predicted, unexplained
 from .fixed_matter import EDGES, SURFACES, VOXELS, Beside, sharpened, surfaces_of
 from .initial_geometry import mirrored
 from .marginal_likelihood import KINDS, beside_unknown
-from .newton import unexplained
 from .null_space import hardly_told
 from .poses import DISTANCE, FLUX, SHIFT, PoseOptions, PoseSearch
 from .shadows import EVEN_OR_NOT, in_even_light

@@ -23,8 +23,7 @@ from ..matter import DeltaBeta
 from ..memory import memory_kept
 from ..model import Instrument, SolvedLight
 from ..optics.background import Light
-from ..optics.noise import noise_share
-from ..optics.noise_model import NoiseModel
+from ..optics.noise import NoiseModel, noise_share
 from ..optics.retrieval import Tikhonov, absorption_alone, tikhonov
 from ..optics.retrieval.bounded import FIXED, MODEL_ERROR, NOWHERE, Leaves
 from ..optics.retrieval.spectra import Raster, filtered, radian, response, spectra, surrounded

@@ -16,8 +16,7 @@ from ..metrics.correlation import shortest_side
 from ..optics.patterns import smooth_modes
 from ..progress import Advance
 from ..ranges import Metres, Share, Weight, checked_dataclass
-from .algebraic import Algebraic, art, sirt
-from .filtered_backprojection import filtered_backprojection
+from .algebraic import Algebraic, art, filtered_backprojection, sirt
 from .primal_dual import PrimalDual
 from .rays import Rays, checked_upper, rays_of
 

@@ -13,9 +13,8 @@ from torch import Tensor
 from ..backends import require_device
 from ..checks import InputError, as_written, in_range, require
 from ..fit.run import interrupts_held
-from ..io.atomic import atomic_path, require_new
+from ..io.atomic import atomic_path, read_json, require_new, write_json
 from ..io.guard import read_archive
-from ..io.json import read_json, write_json
 from ..io.pvd import TimeStep, write_pvd
 from ..io.vtk import write_mesh
 from ..mesh import TriangleMesh
@@ -24,7 +23,7 @@ from ..ranges import Seconds, Seed, Small, checked_dataclass
 from ..specimens.flow.channel import Channel
 from ..specimens.flow.suspension import Medium, State, Stepper, Suspension
 from ..specimens.membrane.model import Elasticity, Membrane
-from ..specimens.membrane.resting import resting_cell
+from ..specimens.membrane.rest import resting_cell
 from ..specimens.red_cells import DIAMETER, SHUFFLES, place_cells
 from ..units import in_percent
 

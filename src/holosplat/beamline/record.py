@@ -10,7 +10,7 @@ import numpy as np
 from ..checks import at_least, in_range, require
 from ..io.atomic import require_apart, require_writable
 from ..io.formats import loader_of, read
-from ..io.hdf5_writing import new_hdf5, put
+from ..io.hdf5 import new_hdf5, put
 from ..io.nxtomo import RawLayout, scan_writer
 from ..io.raw_file import DARK, FLAT, PROJECTION
 from ..io.reading import Part

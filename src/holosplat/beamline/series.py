@@ -13,7 +13,7 @@ from ..checks import in_range, require
 from ..io.pvd import find_snapshots
 from ..progress import Advance
 from ..ranges import Frequency, Seconds, Signed, Weight, checked_dataclass
-from ..specimens.mesh_series import ROUNDING, MeshSeries
+from ..specimens.scene import ROUNDING, MeshSeries
 from ..units import LENGTH_UNITS, unit_factor
 from .simulate import Filling, Shutter, field_centre, filled_scene
 

@@ -25,9 +25,8 @@ from ..optics.sampling import resolving_oversample
 from ..progress import Advance
 from ..ranges import Many, Photons, Seed, checked_dataclass
 from ..scan import Exposures, Scan, interleaved_split
-from ..specimens.mesh_series import MeshSeries
 from ..specimens.repair import closed
-from ..specimens.scene import MeshScene
+from ..specimens.scene import MeshScene, MeshSeries
 from ..units import LENGTH_UNITS, unit_factor, wavenumber
 from ..volume import LineIntegrals, Object, Volume, mean_wave
 from .light import EVEN_LIGHT, UnevenLight

@@ -17,7 +17,7 @@ from ..matter import Matter
 from ..mesh import TriangleMesh
 from ..ranges import Metres, Weight, checked_dataclass
 from ..representations import SurfaceMesh, isosurface
-from ..specimens.membrane.resting import FREQUENCIES, resting_cell
+from ..specimens.membrane.rest import FREQUENCIES, resting_cell
 from ..specimens.repair import closed
 
 RED_CELL = "red-cell"

@@ -247,7 +247,7 @@ def _end(result: Reconstruction, out: Path, strict: bool) -> None:
 
 def _print_result(folder: RunFolder, result: Reconstruction, report: Path) -> None:
     """What was found and decided, and whether it explains the frames."""
-    from ..io.json import read_json
+    from ..io.atomic import read_json
 
     if folder.light.is_file():
         say(f"light: {read_json(folder.summary)['light']} ({folder.light})")

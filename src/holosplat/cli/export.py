@@ -244,7 +244,7 @@ def _exposures_of(folder: RunFolder, volume: Path, frame: int | None) -> Exposur
     None, said, where the scan cannot be read."""
     from ..io.formats import HDF5_SUFFIXES, read_frames, run_reading
     from ..io.reading import at_time
-    from ..workflows.refine import where_found
+    from ..workflows.reconstruction import where_found
 
     if volume.suffix.lower() not in HDF5_SUFFIXES:
         return None
@@ -265,7 +265,7 @@ def _export_volume(
     frame: int | None = None,
 ) -> Grid:
     from ..geometry import Grid
-    from ..io.json import read_json
+    from ..io.atomic import read_json
     from ..planning.acts import of_export
     from ..scan import PIXEL_RANGE_M
     from ..workflows.export import export as write

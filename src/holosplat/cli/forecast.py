@@ -38,8 +38,7 @@ from ..workflows.forecast import forecast as carry_on
 from ..workflows.preconditions import goes_on
 from ..workflows.provenance import environment
 from ..workflows.reconstruct import load_reconstruction
-from ..workflows.reconstruction import instants_of, reconstruction_at
-from ..workflows.refine import where_found
+from ..workflows.reconstruction import instants_of, reconstruction_at, where_found
 from ..workflows.run_folder import RunFolder, claimed
 from ..workflows.track import COLLECTION, TRACKS
 from .places import Output

@@ -9,7 +9,7 @@ from ..beamline.grow import grow as run
 from ..io.lock import sole_writer
 from ..planning.acts import of_growth
 from ..planning.needs import Needs
-from ..specimens.membrane.resting import nodes_of
+from ..specimens.membrane.rest import nodes_of
 from ..units import in_percent
 from .places import Output
 from .progress import ProgressBar

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from ..ranges import Jobs, Seed, Within
-from ..training.options import TrainOptions
-from ..training.ranges import Ranges
+from ..training.options import Ranges, TrainOptions
 from .places import Kept, Output
 from .progress import ProgressBar
 from .room import tell

@@ -21,8 +21,7 @@ from typing import Annotated, Any, ParamSpec, TypeVar, get_args, get_origin
 from tyro.conf import Positional, arg
 
 from ..checks import InputError, require
-from ..io.atomic import is_taken, require_new, require_parent
-from ..io.json import read_json
+from ..io.atomic import is_taken, read_json, require_new, require_parent
 from ..io.leftovers import LOCK
 from ..io.lock import require_unwritten
 from ..io.provenance import NAME, Command, beside, carried_out, records

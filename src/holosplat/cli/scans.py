@@ -15,8 +15,7 @@ from ..representations import InMotion, MovingSurfaces, SurfaceMesh
 from ..scan import Scan
 from ..workflows.preconditions import require_one_time
 from ..workflows.reconstruct import load_reconstruction
-from ..workflows.reconstruction import Reconstruction, chosen_frames, instants_of, reconstruction_at
-from ..workflows.refine import where_found
+from ..workflows.reconstruction import Reconstruction, chosen_frames, instants_of, reconstruction_at, where_found
 from ..workflows.run_folder import RunFolder
 
 

@@ -37,9 +37,8 @@ if TYPE_CHECKING:
     from ..specimens.carried import CarriedScene
     from ..specimens.continuous import ContinuousScene
     from ..specimens.drawn import ChangingScene, Drawn
-    from ..specimens.mesh_series import MeshSeries
     from ..specimens.rods import RodScene
-    from ..specimens.scene import MeshScene, VoxelScene
+    from ..specimens.scene import MeshScene, MeshSeries, VoxelScene
     from ..volume import Object
 
     Still = MeshScene | ContinuousScene | VoxelScene | CarriedScene | RodScene | ChangingScene

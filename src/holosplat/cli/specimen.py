@@ -25,9 +25,8 @@ if TYPE_CHECKING:
     from ..specimens.drawn import ChangingScene, Drawn
     from ..specimens.matter import Changing as ChangingMatter
     from ..specimens.matter import FieldMatter
-    from ..specimens.mesh_series import MeshSeries
     from ..specimens.rods import RodScene
-    from ..specimens.scene import MeshScene, VoxelScene
+    from ..specimens.scene import MeshScene, MeshSeries, VoxelScene
 
     Still = MeshScene | ContinuousScene | VoxelScene | CarriedScene | RodScene | ChangingScene
     AnyMatter = FieldMatter | ChangingMatter
@@ -91,8 +90,7 @@ class SourceOptions:
     ) -> Iterator[np.ndarray]:
         """Frames [H, W] of `matter`, one after another."""
         from ..beamline.simulate import polychromatic_frames, refilled, simulated_frames
-        from ..specimens.mesh_series import MeshSeries
-        from ..specimens.scene import MeshScene
+        from ..specimens.scene import MeshScene, MeshSeries
 
         light = self.light(exposures.one_energy("a simulation"))
         if light is None:

@@ -11,9 +11,8 @@ from typing import Any
 from tyro.conf import Positional
 
 from ..checks import require
-from ..io.atomic import atomic_folder
+from ..io.atomic import atomic_folder, write_json
 from ..io.formats import read_volume_file
-from ..io.json import write_json
 from ..io.reading import Reading
 from ..io.vtk import write_mesh
 from ..mesh import TriangleMesh

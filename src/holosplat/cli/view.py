@@ -93,8 +93,7 @@ def view(what: Positional[Path], port: Port = 8080) -> None:
         port: Port; the next free one is taken.
     """
     from ..show.server import LiveView
-    from ..workflows.run_folder import RunFolder
-    from ..workflows.run_status import fitted_by
+    from ..workflows.run_folder import RunFolder, fitted_by
 
     folder = RunFolder(what)
     followed = what.is_dir() and fitted_by(folder) is not None
@@ -191,7 +190,7 @@ def compare(
 
 def _side(path: Path) -> Side:
     """A run with its scores, as far as its scan is still there."""
-    from ..io.json import read_json
+    from ..io.atomic import read_json
     from ..io.reading import Part, Reading
     from ..report.compare import side_of
     from ..workflows.reconstruction import instants_of

@@ -20,10 +20,9 @@ from ..geometry import Grid
 from ..memory import memory_kept
 from ..model import Model
 from .optimiser import Leaves, Optimiser, Trainable
-from .problem import Batch, Batches, CapturedStep, Problem
+from .problem import Batch, Batches, CapturedStep, Problem, Schedule
 from .residuals import Judge
 from .run import Record, interrupts_held
-from .schedule import Schedule
 
 UNREAD_STEPS = 20
 """Steps on a GPU between looks at their values, each of which waits for it."""

@@ -13,7 +13,7 @@ from torch.nn.functional import pad
 from ..matter import DeltaBeta
 from ..model import Instrument, LightField
 from ..optics.background import Light
-from ..optics.noise_model import NoiseModel
+from ..optics.noise import NoiseModel
 from ..optics.patterns import cosines
 from ..optics.retrieval.spectra import Raster, response, squared_frequency
 from ..optics.sampling import fringe_sampling

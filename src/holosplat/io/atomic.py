@@ -1,9 +1,10 @@
-"""Writing a file or a folder whole or not at all, so that it is there after a crash, too."""
+"""Files and folders written whole or not at all, so that they are there after a crash, too; JSON tables among them."""
 
 from __future__ import annotations
 
 import csv
 import io
+import json
 import os
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ..checks import InputError, require
+from ..tables import read_table
 from .leftovers import clear_leftovers, flushed, flushed_tree, is_begun, temporary_name
 from .provenance import leave_record, require_free
 
@@ -119,3 +121,15 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
         raise InputError(f"{path} must be writable, but writing it failed: {error}.") from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def write_json(path: Path, values: dict[str, Any]) -> None:
+    """Write `values` as JSON, whole or not at all."""
+    text = json.dumps(values, indent=2, allow_nan=False)
+    with atomic_path(path) as temporary:
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON table; `InputError` if the file is missing or damaged."""
+    return read_table(path)

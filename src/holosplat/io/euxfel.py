@@ -19,8 +19,7 @@ import numpy as np
 
 from ..checks import InputError, MissingError, UnsaidError, as_written, positive, require, warn
 from ..frames import Derived, Taken
-from ..preprocess.flat_field import mean_frame, relative_intensity
-from ..preprocess.pixels import filled, lit
+from ..preprocess.pixels import filled, lit, mean_frame, relative_intensity
 from ..scan import Exposures, Scan
 from .hdf5 import open_hdf5
 from .raw_file import DARK, FLAT, NOTHING, PROJECTION, TAKES, Loader, ScanFile, exposures_of, together

@@ -16,9 +16,9 @@ import numpy as np
 
 from ..checks import InputError
 from ..geometry import Grid
+from .atomic import read_json
 from .formats import FORMATS, HDF5_SUFFIXES, volume_format
 from .hdf5 import Fields, attribute_numbers, attribute_text, open_hdf5
-from .json import read_json
 from .ome import TIFF_SUFFIXES, ZARR_SUFFIX, ome_grid
 from .volumes import ABSORPTION, MU, REFRACTION, Contents
 from .vtk import SUFFIXES as MESHES

@@ -24,7 +24,7 @@ from ..ranges import Small, checked_dataclass
 from ..scan import Scan
 from ..volume import Object, Volume
 from . import arrays, euxfel, images, nerf_synthetic, nxtomo, r2_gaussian
-from .file_order import in_order
+from .angles import in_order
 from .hdf5 import open_hdf5
 from .hdf5_guard import is_vouched
 from .ome import TIFF_SUFFIXES, ZARR_SUFFIX, read_ome_tiff, read_ome_zarr, require_zarr, write_ome_tiff, write_ome_zarr

@@ -20,10 +20,8 @@ import numpy as np
 
 from ..checks import InputError, finite, note, require, require_regular
 from ..scan import Scan
-from .angles import angles_of, read_angles, tell_angles
-from .atomic import atomic_folder
-from .file_order import in_order
-from .json import write_json
+from .angles import angles_of, in_order, read_angles, tell_angles
+from .atomic import atomic_folder, write_json
 from .leftovers import is_hidden
 from .light_frames import light_frames
 from .raw_file import DARK, FLAT, NOTHING, PROJECTION, RAW_TAKES, Loader, ScanFile

@@ -12,8 +12,7 @@ import numpy as np
 
 from ..checks import InputError, finite, require
 from ..divided_light import DividedLight
-from .hdf5 import Fields, open_hdf5
-from .hdf5_writing import new_hdf5, put
+from .hdf5 import Fields, new_hdf5, open_hdf5, put
 
 if TYPE_CHECKING:
     from ..optics.background import Background

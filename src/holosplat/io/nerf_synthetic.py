@@ -19,9 +19,8 @@ from ..checks import InputError, UnsaidError, at_least, in_range, require
 from ..geometry import Views
 from ..ranges import Metres, Positive, Signed, Small, checked_dataclass
 from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, Scan, checked_distance
-from .atomic import atomic_folder
+from .atomic import atomic_folder, write_json
 from .guard import undamaged
-from .json import write_json
 from .raw_file import Loader, folder_with, require_said, stand_in
 from .seeds import hull_points, uniform_points
 from .table import Table, beam_table, exposure_table, in_order, read_exposures

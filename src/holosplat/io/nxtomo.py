@@ -17,7 +17,7 @@ from ..divided_light import DividedLight
 from ..scan import ENERGY_RANGE_KEV, Exposures, Scan
 from ..units import wavelength
 from ..version import __version__
-from .hdf5_writing import new_hdf5, put, room_for
+from .hdf5 import new_hdf5, put, room_for
 from .light import LIGHT, write_divided_light
 from .nxtomo_geometry import CONE
 from .raw_file import NOTHING, PROJECTION, RAW_TAKES, Loader

@@ -26,8 +26,7 @@ from ..representations import KINDS, GaussianCloud, Stored
 from ..representations.gaussians import PARAMETERS
 from . import compact
 from .compact import SERIES, Steps, Whole, get_whole, order_of, ordered, put_whole, size_of
-from .hdf5 import Fields, attribute_numbers, open_hdf5
-from .hdf5_writing import new_hdf5, put
+from .hdf5 import Fields, attribute_numbers, new_hdf5, open_hdf5, put
 
 FORMAT = "holosplat object 1"
 MOST_TEXT = 60_000

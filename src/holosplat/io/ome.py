@@ -22,7 +22,7 @@ from ..units import LENGTH_UNITS, unit_factor
 from ..volume import Object, Volume
 from .atomic import atomic_folder, atomic_path, require_new
 from .guard import require_memory
-from .hdf5_writing import require_room
+from .hdf5 import require_room
 from .stacks import all_images, image_numbers, open_tiff
 from .volumes import ABSORPTION, NAMES, REFRACTION, SLAB_VOXELS, Contents, Stored, contents_of, grid_of, slabs_of
 

@@ -10,9 +10,8 @@ import numpy as np
 
 from ..checks import require, shaped
 from ..scan import Exposures
-from .atomic import atomic_folder
-from .hdf5_writing import new_hdf5, put
-from .json import write_json
+from .atomic import atomic_folder, write_json
+from .hdf5 import new_hdf5, put
 from .table import exposure_table
 
 FORMAT = "holosplat phase maps 1"

@@ -29,7 +29,7 @@ from ..version import __version__
 from ..volume import Object
 from .atomic import atomic_path
 from .guard import require_declared, require_memory
-from .hdf5_writing import require_room
+from .hdf5 import require_room
 from .volumes import NAMES, REFRACTION, Contents, Stored, contents_of, grid_of, slab_rows, slabs_of
 
 MICROMETRES = 1e6

@@ -20,9 +20,8 @@ from ..ranges import checked_dataclass
 from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, Scan
 from ..units import wavenumber
 from ..volume import Volume
-from .atomic import atomic_folder
+from .atomic import atomic_folder, write_json
 from .guard import read_array
-from .json import write_json
 from .raw_file import Loader, folder_with, stand_in
 from .seeds import hull_points
 from .table import Table, beam_table, exposure_table, in_order, read_exposures

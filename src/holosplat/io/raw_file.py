@@ -13,7 +13,7 @@ import numpy as np
 from ..checks import UnsaidError, in_range, note, require
 from ..divided_light import DividedLight
 from ..geometry import Views, rotation_y
-from ..preprocess.flat_field import mean_frame
+from ..preprocess.pixels import mean_frame
 from ..scan import DISTANCE_RANGE_M, PIXEL_RANGE_M, Exposures, checked_distance
 from ..units import BEAM_RANGE_KEV
 from .stacks import ImageStack

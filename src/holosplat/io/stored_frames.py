@@ -13,8 +13,7 @@ import numpy as np
 
 from ..checks import InputError, note, require
 from ..frames import Derived, Frames, Taken
-from ..preprocess.flat_field import relative_intensity
-from ..preprocess.pixels import FILLED, MOST_DEFECTS, filled, lit
+from ..preprocess.pixels import FILLED, MOST_DEFECTS, filled, lit, relative_intensity
 from ..scan import Scan
 from .hdf5 import open_hdf5
 from .light_frames import light_frames, require_filled

@@ -13,7 +13,7 @@ from ..checks import InputError, finite, require, shaped
 from ..geometry import Views, rotation_y
 from ..scan import Exposures, Scan
 from ..tables import shown
-from .json import read_json
+from .atomic import read_json
 
 
 @dataclass(frozen=True)

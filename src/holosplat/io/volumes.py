@@ -15,8 +15,7 @@ from ..matter import Matter
 from ..progress import Advance
 from ..units import wavenumber
 from ..volume import Object, Volume
-from .hdf5 import Fields, attribute_numbers, open_hdf5
-from .hdf5_writing import new_hdf5, put, room_for
+from .hdf5 import Fields, attribute_numbers, new_hdf5, open_hdf5, put, room_for
 
 NAMES = ("delta", "beta")
 VOXEL_RANGE_M = (1e-10, 1e-2)

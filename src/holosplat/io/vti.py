@@ -28,7 +28,7 @@ from ..units import LENGTH_UNITS, unit_factor
 from ..volume import Object
 from .atomic import atomic_path
 from .guard import blocks_fault, require_declared, require_memory, xml_fault
-from .hdf5_writing import require_room
+from .hdf5 import require_room
 from .plain_values import LENGTH_UNIT, fill, micrometres
 from .volumes import NAMES, REFRACTION, Contents, Stored, contents_of, grid_of
 from .vtk import BODY, TRIANGLE, numbers_of, quiet, save

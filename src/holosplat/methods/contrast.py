@@ -16,7 +16,7 @@ from ..checks import InputError
 from ..inference import Decision, Score, select
 from ..matter import MaterialPrior
 from ..optics.background import LightOptions
-from .first_volumes import FirstVolumes
+from .cross_validation import FirstVolumes
 from .trials import WITHOUT, Hypothesis, Trials, name_of
 
 STAGE = "sign of the contrast"

@@ -1,22 +1,35 @@
-"""Frames of objects, and what of the matter is missing from them."""
+"""What hypotheses about light, noise and matter are compared by: frames that objects predict, what is missing from
+them, and first volumes of coarse frames. Views are set aside in folds; the volumes of the others, by retrieval and
+tomography without bounds, predict them."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..baselines.holographic_tv import Correction
-from ..matter import DeltaBeta
+from ..backends import resolve
+from ..baselines import HolographicTV, holographic_tv
+from ..baselines.algebraic import Algebraic, sirt
+from ..baselines.holographic_tv import Correction, retrieved
+from ..geometry import Grid
+from ..matter import DeltaBeta, KnownRatio, MaterialPrior, Matter
 from ..memory import memory_kept
 from ..model import Instrument, Model
-from ..optics.noise_model import NoiseModel
+from ..optics.background import Background, Light
+from ..optics.noise import NoiseModel, noise_levels
+from ..optics.retrieval import paganin
 from ..optics.sampling import alike, fringe_sampling
-from ..representations import Stored
+from ..progress import Progress
+from ..representations import Stored, VoxelGrid
 from ..scan import Exposures, Scan
 from ..volume import Object
+from .assumed import assumed_material
 
 DRAWS = 16
 """Of the noise, for what it leaves of the matter: a standard deviation by so many is right to a sixth."""
@@ -67,3 +80,169 @@ class MissingMatter:
         left = (self.of(self.scan.left(predicted)) - float(draws.mean())) / self.whole
         deviation = float(draws.std(correction=0)) / self.whole
         return math.sqrt(left) if left > HIDDEN * deviation else 0.0
+
+
+PICTURE_WIDTH, PICTURE_VIEWS = 48, 32
+"""Frames of a first picture are binned to about so many pixels, and it takes so many of them at most: on one core it is
+there in half a second."""
+PICTURE_RATIO = 1000.0
+"""δ/β of a first picture where it is not known, which only its blur depends on: that of soft matter and light elements
+is 300 to 3000 at 8 to 30 keV."""
+PICTURE_SWEEPS = Algebraic(sweeps=20, relaxation=1.9, nonnegative=True)
+"""Sweeps of its tomography: more change nothing that is seen."""
+WIDTH = 64
+"""Frames are binned to about so many pixels at most, on which a volume takes a second."""
+FEWEST = 3
+"""Views from which on some are set aside; of fewer, noise is added and taken off again (`Folds`)."""
+MANY, MOST = 6, 3
+"""Views from which on two are set aside at a time, and folds at most: six views tell their scatter well enough."""
+EFFORT = 0.2
+"""Part of the usual steps of a fit by which hypotheses are compared: all of them have as many."""
+CHECKED = 4
+"""Edge of the squares [pixels], in which unknown light of unseen frames is fitted and tested in turns."""
+
+T = TypeVar("T")
+
+BY_VIEWS, BY_FISSION = "views set aside", "data fission"
+
+
+def coarse_binning(scan: Scan) -> int:
+    """How many pixels along an edge are joined for first volumes."""
+    return scan.largest_binning(math.ceil(max(scan.views.shape) / WIDTH))
+
+
+def first_picture(train: Scan, prior: MaterialPrior) -> VoxelGrid:
+    """A coarse volume of training frames at once, to look at: of several times, that of the one in the middle.
+
+    Paganin's filter on binned frames (`optics.retrieval.paganin`), then SIRT without negative values. Where δ is not
+    known, the densest voxel stands for one. Nothing random is drawn, and no result depends on it. Errors: `InputError`
+    for frames that cannot be retrieved.
+    """
+    one = train.at_instant(len(train.instants) // 2) if train.is_series else train
+    one = one[np.unique(np.linspace(0, len(one) - 1, min(len(one), PICTURE_VIEWS)).round().astype(int))]
+    scan = one.binned(one.largest_binning(math.ceil(max(one.views.shape) / PICTURE_WIDTH)))
+    ratio = prior.ratio if isinstance(prior, KnownRatio) else prior.delta_sign * PICTURE_RATIO
+    delta = prior.delta_sign * 1e-6  # any: the thickness is found in its units
+    delta, beta = prior.materials[0] if prior.materials else DeltaBeta(delta, delta / ratio)
+    known = {"missing": scan.gaps, "two_sided": prior.two_sided}
+    lines = paganin(torch.from_numpy(scan.frames), scan.exposures, delta, beta, **known)
+    grid = Grid.of_views(scan.views)
+    values = sirt(lines, scan.views, grid, None, lambda fraction: None, options=PICTURE_SWEEPS, **known)
+    top = 1.0 if prior.materials else max(float(values.abs().max()), 1e-30)
+    return VoxelGrid(values[None] / top, grid, Matter.one(delta * top, beta * top))
+
+
+@dataclass(frozen=True)
+class Folds:
+    """Coarse frames, and how parts of them are kept from a fit.
+
+    Of fewer views than `FEWEST` none can be spared. Then noise is split (Leiner et al. 2023): with noise of standard
+    deviation σ and normal ε, `y + σ ε` and `y - σ ε` are independent; one is fitted and the other predicted. That sees
+    what follows noise, and nothing of what lies between views.
+    """
+
+    scan: Scan
+    count: int
+    by: str
+    binning: int = 1
+    shape: tuple[int, int] | None = None
+    """(H, W) of the frames before binning; None: as these."""
+
+    @classmethod
+    def of(cls, train: Scan) -> Folds:
+        """Of training frames of one time."""
+        binning, views = coarse_binning(train), len(train)
+        by, most = (BY_FISSION, 1) if views < FEWEST else (BY_VIEWS, MOST if views >= MANY else views)
+        return cls(train.binned(binning), most, by, binning, train.views.shape)
+
+    def aside(self, fold: int) -> np.ndarray:
+        """Numbers of the views that are not fitted. Folds share none; many views are not all predicted."""
+        views = len(self.scan)
+        together = 1 if views < MANY else 2
+        chosen = np.unique(np.arange(together * self.count) * views // (together * self.count))
+        return chosen[fold :: self.count]
+
+    def kept(self, fold: int) -> np.ndarray:
+        """Numbers of the views that are fitted: all of them, where noise is split."""
+        views = np.arange(len(self.scan))
+        return views if self.by == BY_FISSION else np.setdiff1d(views, self.aside(fold))
+
+    def split(self, fold: int) -> tuple[Scan, Scan]:
+        """What is fitted, and what is predicted."""
+        if self.by == BY_FISSION:
+            frames = torch.from_numpy(self.scan.frames)
+            draw = torch.randn(frames.shape, generator=torch.Generator().manual_seed(0))
+            noise = noise_levels(self.scan.measured)[:, None, None].float() * draw
+            return tuple(replace(self.scan, frames=(frames + s * noise).numpy()) for s in (1, -1))  # type: ignore[return-value]
+        return self.scan[self.kept(fold)], self.scan[self.aside(fold)]
+
+
+@dataclass
+class FirstVolumes:
+    """The volumes of a scan's folds under hypotheses, each made once."""
+
+    folds: Folds
+    prior: MaterialPrior
+    on_progress: Progress
+    options: HolographicTV = field(
+        default_factory=lambda: HolographicTV(
+            retrieval=20, iterations=80, corrections=3, upper=0.0, refine=1, beyond=False, relit=1
+        )
+    )
+    taken: tuple[str, ...] = ()
+    """What was decided of light and noise."""
+    _material: DeltaBeta | None = None
+    _made: dict[tuple[object, int], object] = field(default_factory=dict)
+
+    @property
+    def material(self) -> DeltaBeta:
+        """The one material that stands for all matter, of the frames as they were measured."""
+        if self._material is None:
+            self._material = assumed_material(self.folds.scan, self.prior, self.on_progress, self.options.backend)
+        return self._material
+
+    @property
+    def _how(self) -> HolographicTV:
+        return replace(self.options, two_sided=self.prior.two_sided)
+
+    def once(self, key: object, fold: int, make: Callable[[], T]) -> T:
+        """What `make` gives, made once for a key and a fold."""
+        if (key, fold) not in self._made:
+            self._made[key, fold] = make()
+        return self._made[key, fold]  # type: ignore[return-value]
+
+    def volume(self, fold: int, light: Light) -> VoxelGrid:
+        """The volume of the fitted frames of a fold, which were measured in `light`."""
+        seen, _ = self.folds.split(fold)
+        even, lines = replace(seen, frames=light.evened(torch.from_numpy(seen.frames)).numpy()), None
+        plain = light.background is None and light.still is None and not light.noise.has_grain
+        if plain and self.folds.by == BY_VIEWS:
+            lines = self.once("thickness", 0, self._thickness)[self.folds.kept(fold)]
+        values, grid = holographic_tv(even, self.material, self._how, self.on_progress, light, lines=lines)
+        return VoxelGrid(values[None], grid, Matter.one(*self.material)).on(resolve(self.options.backend))
+
+    def _thickness(self) -> Tensor:
+        """What phase retrieval finds in all coarse frames as they were measured, each by itself: folds share it."""
+        return retrieved(self.folds.scan, self.material, self._how, self.on_progress)
+
+
+def lit_by_halves(measured: Tensor, predicted: Tensor, known: Background) -> Tensor:
+    """Frames [V, H, W] predicted in even light, in the light that the measured ones have: in each half of a
+    checkerboard as the other half says, so that no pixel tells its own."""
+    shared = replace(
+        known,
+        coefficients=known.coefficients[:1].expand(len(measured), -1),
+        covariances=known.covariances[:1].expand(len(measured), -1, -1),
+        powers=known.powers.mean().expand(len(measured)),
+    )
+    y, x = np.mgrid[: measured.shape[1], : measured.shape[2]] // CHECKED
+    half, lit = torch.from_numpy((x + y) % 2 == 0), predicted.double().clone()
+    for part in (half, ~half):
+        factor = shared.seen_beside(measured, predicted, part).factor()
+        lit[:, ~part] *= factor[:, ~part]
+    return lit
+
+
+def predictions(found: Object, scan: Scan) -> Tensor:
+    """Frames [V, H, W] of an object in even light."""
+    return predicted_frames(scan.exposures, found)

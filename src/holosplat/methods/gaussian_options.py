@@ -12,7 +12,7 @@ from ..baselines.material import MaterialEstimate
 from ..baselines.two_materials import TwoMaterials
 from ..checks import at_least, require
 from ..fit.density import DensityControl
-from ..fit.schedule import Schedule
+from ..fit.problem import Schedule
 from ..fit.terms import Objective
 from ..learning.start import LearnedStart
 from ..ranges import Pixels, Rate, Share, Weight, checked_dataclass

@@ -8,9 +8,8 @@ import numpy as np
 import torch
 
 from ..checks import InputError, require
-from ..fit.problem import Term
+from ..fit.problem import Schedule, Term
 from ..fit.residuals import Judge, set_aside, split_validation
-from ..fit.schedule import Schedule
 from ..fit.terms import TERMS, FrameTerm, Objective
 from ..matter import Matter
 from ..model import Instrument, Model, SolvedLight

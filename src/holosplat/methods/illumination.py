@@ -26,8 +26,7 @@ from .assumed import assumed_material
 from .auto import Auto
 from .contrast import STAGE as SIGN
 from .contrast import Scoring, decide_sides, decide_sign, with_sign
-from .cross_validation import predicted_frames
-from .first_volumes import BY_FISSION, EFFORT, FirstVolumes
+from .cross_validation import BY_FISSION, EFFORT, FirstVolumes, predicted_frames
 from .levels import SHOWN, TrialFits, blind
 from .method import Method, Task, first_of_task
 from .trials import UNEVEN, WITHOUT, Hypothesis, Trials, name_of, named, plain_light, rivals, with_more

@@ -15,8 +15,7 @@ from ..checks import NoMatterError
 from ..inference import Decision, Score, select
 from ..representations import Stored
 from ..scan import Scan
-from .cross_validation import predicted_frames
-from .first_volumes import EFFORT, Folds
+from .cross_validation import EFFORT, Folds, predicted_frames
 from .keeper import NAME, Unseen
 from .method import Method, Task, run_stages, unheard
 

@@ -29,8 +29,7 @@ from ..matter import DeltaBeta, Matter
 from ..mesh import TriangleMesh
 from ..representations import GaussianCloud, SurfaceMesh
 from .coarse import Way, first_of
-from .cross_validation import predicted_frames
-from .first_volumes import BY_FISSION, Folds
+from .cross_validation import BY_FISSION, Folds, predicted_frames
 from .gaussian_options import GaussianOptions
 from .method import Task, run_quietly
 from .start import cloud_of, starting_cloud

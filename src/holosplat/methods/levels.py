@@ -21,7 +21,7 @@ from ..checks import NoMatterError
 from ..inference import Decision, Score, select
 from ..matter import MatterKind
 from ..representations import Stored, VoxelGrid
-from .first_volumes import BY_FISSION, EFFORT, FirstVolumes, predictions
+from .cross_validation import BY_FISSION, EFFORT, FirstVolumes, predictions
 from .method import Method, Task, first_of_task, solve_stages
 from .trials import WITHOUT, Hypothesis, Trial, Trials, accepted, hypothesis_of, name_of
 from .uncertain import Determined, likeliest_ratio

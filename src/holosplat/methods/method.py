@@ -19,13 +19,13 @@ from ..learning.start import GuessedMatter
 from ..matter import MaterialPrior, MatterKind
 from ..model import Model
 from ..optics.background import Light, LightOptions
-from ..optics.noise_model import NoiseModel
+from ..optics.noise import NoiseModel
 from ..optics.retrieval import absorption_alone
 from ..progress import Advance, Progress
 from ..representations import KINDS, Stored, VoxelGrid
 from ..scan import Scan
 from ..tables import with_entries
-from .first_volumes import FirstVolumes, Folds
+from .cross_validation import FirstVolumes, Folds
 from .keeper import Keeper, Unseen, placed_at, where
 from .window import windows_of
 

@@ -18,7 +18,7 @@ from ..fit.smooth_volume import ContinuousPrior, VolumeProblem
 from ..fit.whitened import WhitenedFrames
 from ..geometry import Grid
 from ..matter import DeltaBeta
-from ..optics.noise_model import NoiseModel
+from ..optics.noise import NoiseModel
 from ..representations import Stored
 from ..scan import Scan
 from ..volume import Object

@@ -16,9 +16,8 @@ from ..baselines import HolographicTV
 from ..checks import at_least, require
 from ..fit.loop import Fit, Plan
 from ..fit.optimiser import Adam, Group, Leaves, Trainable
-from ..fit.problem import Problem
+from ..fit.problem import Problem, Schedule
 from ..fit.run import Record
-from ..fit.schedule import Schedule
 from ..fit.terms import Objective
 from ..fit.terms.field import FieldVariation, RetrievedThickness
 from ..geometry import Grid, Poses, Views

@@ -18,8 +18,7 @@ from torch import Tensor
 from ..checks import require
 from ..fit.loop import Fit, Plan
 from ..fit.optimiser import Adam
-from ..fit.problem import Problem, Term
-from ..fit.schedule import Schedule
+from ..fit.problem import Problem, Schedule, Term
 from ..fit.terms import Objective
 from ..fit.terms.field import AlignedFrames, AlignedLines
 from ..geometry import Grid

@@ -13,8 +13,7 @@ from ..baselines import HolographicTV, holographic_tv
 from ..checks import at_least, require
 from ..fit.loop import Fit, Plan
 from ..fit.optimiser import Adam
-from ..fit.problem import Problem, Term
-from ..fit.schedule import Schedule
+from ..fit.problem import Problem, Schedule, Term
 from ..fit.terms import Objective
 from ..fit.terms.equations import Equations, EquationTerm, SpaceTimeVariation
 from ..matter import Matter

@@ -29,7 +29,7 @@ from ..inference import Decision, Score, select
 from ..matter import DeltaBeta, Matter
 from ..memory import memory_kept
 from ..optics.coherence import joined_blur_px
-from ..optics.noise_model import NoiseModel
+from ..optics.noise import NoiseModel
 from ..optics.sampling import fringe_sampling
 from ..ranges import Share, checked_dataclass
 from ..representations import VoxelGrid

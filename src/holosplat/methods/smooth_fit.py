@@ -22,7 +22,7 @@ from ..matter import DeltaBeta
 from ..memory import memory_kept
 from ..model import Instrument, Model
 from ..optics.background import Light
-from ..optics.noise_model import NoiseModel
+from ..optics.noise import NoiseModel
 from ..optics.sampling import fringe_sampling
 from ..representations import VoxelGrid
 from ..scan import Scan

@@ -20,8 +20,7 @@ from ..checks import in_range, positive, require
 from ..fit.loop import Fit, Plan
 from ..fit.optimiser import Adam, Group
 from ..fit.pose_refinement import PoseRefinement, with_pose_refinement
-from ..fit.problem import Problem, Term
-from ..fit.schedule import Schedule
+from ..fit.problem import Problem, Schedule, Term
 from ..fit.terms import Objective
 from ..fit.terms.object import Bending, membrane_inverse
 from ..geometry import Grid, Views

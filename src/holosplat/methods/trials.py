@@ -13,11 +13,11 @@ from torch.nn.functional import interpolate, pad
 from ..checks import InputError, require
 from ..inference import MARGIN, Score
 from ..optics.background import FLUX, ORDER, Background, Light, LightOptions
-from ..optics.noise_model import NoiseModel
+from ..optics.noise import NoiseModel
 from ..optics.patterns import fixed_pattern, smooth_modes
 from ..representations import VoxelGrid
 from ..scan import Scan
-from .first_volumes import FirstVolumes, coarse_binning, lit_by_halves, predictions
+from .cross_validation import FirstVolumes, coarse_binning, lit_by_halves, predictions
 from .method import Task
 
 NULL = "as measured"

@@ -13,9 +13,8 @@ from ..baselines.beyond import margins_of
 from ..checks import at_least, require
 from ..fit.loop import Fit, Plan
 from ..fit.optimiser import Leaves
-from ..fit.problem import Problem
+from ..fit.problem import Problem, Schedule
 from ..fit.projected_gradient import ProjectedGradient
-from ..fit.schedule import Schedule
 from ..fit.terms import Objective
 from ..fit.terms.object import VoxelVariation
 from ..geometry import Grid

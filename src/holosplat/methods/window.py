@@ -16,7 +16,7 @@ from scipy.special import chdtri, ndtri
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from ..optics.noise_model import NoiseModel
+from ..optics.noise import NoiseModel
 from ..scan import Scan
 
 LARGE = 256 * 256

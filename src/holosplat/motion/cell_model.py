@@ -16,7 +16,7 @@ from ..ranges import Signed, Small, ranged
 from ..specimens.flow.channel import Channel
 from ..specimens.flow.suspension import Medium
 from ..specimens.membrane.model import Elasticity, Membrane
-from ..specimens.membrane.resting import resting_cell
+from ..specimens.membrane.rest import resting_cell
 from .membrane_fit import Bound, CellFlow, Unknowns, Velocity, advanced, dressed, scaled
 
 ENDLESS = 1e-3

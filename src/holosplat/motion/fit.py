@@ -15,11 +15,10 @@ from torch import Tensor
 from ..checks import at_least, in_range, positive, require
 from ..fit.loop import Fit, Plan
 from ..fit.optimiser import Adam, Group, Leaves, Optimiser
-from ..fit.problem import Problem, Term
+from ..fit.problem import Problem, Schedule, Term
 from ..fit.quasi_newton import QuasiNewton
 from ..fit.residuals import Prediction
 from ..fit.run import Run
-from ..fit.schedule import Schedule
 from ..fit.terms import Objective
 from ..inference import Compared, Decision, Score
 from ..methods.ground import Ground, ground

@@ -15,7 +15,7 @@ from ..fit.whitened import WhitenedFrames
 from ..inference import Compared
 from ..matter import DeltaBeta
 from ..methods import Task
-from ..optics.noise_model import NoiseModel
+from ..optics.noise import NoiseModel
 from ..representations import Flow, Lattice, TimeBasis
 from ..scan import Scan
 

@@ -11,7 +11,7 @@ from scipy.optimize import linear_sum_assignment
 
 from ..bodies.rest_shape import KnownBody
 from ..checks import at_least, in_range, require
-from ..fit.schedule import Schedule
+from ..fit.problem import Schedule
 from ..inference import Score, select
 from ..learning.start import LearnedStart
 from ..matter import DeltaBeta, Matter

@@ -7,7 +7,7 @@ from .detector import bin_pixels as bin_pixels
 from .detector import blur as blur
 from .detector import poisson as poisson
 from .illumination import Illumination as Illumination
-from .noise_model import NoiseModel as NoiseModel
+from .noise import NoiseModel as NoiseModel
 from .propagation import exit_wave as exit_wave
 from .propagation import exit_wave_minus_one as exit_wave_minus_one
 from .propagation import fresnel_propagate as fresnel_propagate

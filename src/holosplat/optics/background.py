@@ -13,7 +13,7 @@ from ..checks import InputError, require
 from ..divided_light import DividedLight
 from ..ranges import checked_dataclass
 from .air import Box, air_in_boxes, find_air, has_air
-from .noise_model import NoiseModel
+from .noise import NoiseModel
 from .patterns import cosines, half_waves, posterior, smooth_modes, sums
 
 ORDER = 8

@@ -28,7 +28,7 @@ from ..methods import (
     Voxels,
     uncertain,
 )
-from ..methods.first_volumes import EFFORT, FEWEST, MANY, MOST, WIDTH
+from ..methods.cross_validation import EFFORT, FEWEST, MANY, MOST, WIDTH
 from ..methods.start import MOST_GAUSSIANS
 from ..optics.sampling import fringe_sampling, on_larger_pixels, padding
 from ..scan import Exposures

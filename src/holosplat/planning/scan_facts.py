@@ -28,8 +28,7 @@ from ..matter import MatterKind
 from ..methods import Auto, HolographicVoxels, Method, NeuralFields, Surfaces, Voxels
 from ..methods.gaussians import Gaussians
 from ..methods.window import windows_of
-from ..optics.noise import noise_levels, noise_share
-from ..optics.noise_model import NoiseModel
+from ..optics.noise import NoiseModel, noise_levels, noise_share
 from ..optics.sampling import fringes, on_larger_pixels
 from ..scan import Exposures, Scan
 from ..units import beam_named, span

@@ -1,8 +1,7 @@
 """From raw counts to relative intensities: dark and flat fields, defective pixels, flat fields that change."""
 
 from .eigen_flats import EigenFlats, TotalVariationWeights, eigen_flats, significant
-from .flat_field import relative_intensity, unlit
-from .pixels import PixelRepair, defective_pixels, fixed_pattern
+from .pixels import PixelRepair, defective_pixels, fixed_pattern, relative_intensity, unlit
 
 __all__ = [
     "EigenFlats",

@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..checks import InputError, as_written, require
-from ..io.atomic import atomic_path, require_writable
+from ..io.atomic import atomic_path, read_json, require_writable
 from ..io.facts import Facts, facts_of_matter, no_kind
 from ..io.formats import loader_of
-from ..io.json import read_json
 from ..io.reading import Reading
 from ..memory import uncollected
 from ..units import beam_named, in_percent

@@ -13,7 +13,7 @@ import torch
 
 from ..checks import as_written
 from ..geometry import Grid, Views
-from ..io.json import read_json
+from ..io.atomic import read_json
 from ..io.volumes import read_guess
 from ..methods import METHODS, learned
 from ..metrics import volume_scores

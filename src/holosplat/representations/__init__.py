@@ -17,13 +17,12 @@ from .gaussians import GaussianCloud
 from .initialise import approximate, at_pitch, cloud_from_shares, cloud_from_volume, freed, random_cloud
 from .isosurface import isosurface
 from .moving_gaussians import MovingGaussians
-from .moving_surfaces import MovingSurfaces
 from .neural_field import Network, NeuralField
 from .paths import TimeBasis
 from .perceptron import Encoding
 from .pixel_aligned import PixelAlignedField
 from .space_time import SpaceTime, SpaceTimeField
-from .surfaces import SurfaceMesh
+from .surfaces import MovingSurfaces, SurfaceMesh
 from .voxels import VoxelGrid, VoxelLines
 
 

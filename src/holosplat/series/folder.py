@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ..checks import as_written, require
-from ..io.atomic import atomic_folder, require_new
-from ..io.json import read_json, write_json
+from ..io.atomic import atomic_folder, read_json, require_new, write_json
 from ..io.leftovers import is_hidden
 from ..io.lock import Writer, writer_of
 from ..tables import from_table

@@ -16,9 +16,8 @@ from ..bodies.rest_shape import moments
 from ..checks import InputError
 from ..geometry import Grid
 from ..inference import Compared, Decision, Score
-from ..io.atomic import atomic_path
+from ..io.atomic import atomic_path, read_json, write_json
 from ..io.guard import read_array
-from ..io.json import read_json, write_json
 from ..matter import MaterialPrior
 from ..methods import Method, Task
 from ..methods.continued import Continued

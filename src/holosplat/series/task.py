@@ -13,8 +13,8 @@ import numpy as np
 
 from ..bodies.rest_shape import moments
 from ..checks import InputError, is_of_memory, require
+from ..io.atomic import write_json
 from ..io.formats import read_frames, run_source
-from ..io.json import write_json
 from ..io.lock import sole_writer
 from ..io.reading import Reading
 from ..metrics import ImageScores

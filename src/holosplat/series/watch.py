@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from ..checks import as_written, require
-from ..io.atomic import is_taken, require_parent, write_rows
+from ..io.atomic import is_taken, read_json, require_parent, write_json, write_rows
 from ..io.formats import read_frames, run_source
-from ..io.json import read_json, write_json
 from ..io.lock import sole_writer
 from ..io.reading import Reading
 from ..matter import MaterialPrior

@@ -9,8 +9,7 @@ from collections.abc import Mapping, Sequence
 from ..checks import InputError
 from ..io.objects import read_object
 from ..representations import Stored
-from ..workflows.run_folder import RunFolder
-from ..workflows.run_status import fitted_by, read_status
+from ..workflows.run_folder import RunFolder, fitted_by, read_status
 from .parts import Frame, Shown, at_times, cut, shown
 from .server import LiveView
 

@@ -26,8 +26,7 @@ from .gas_waves import ExpandingShock as ExpandingShock
 from .membrane.model import Elasticity as Elasticity
 from .membrane.model import Membrane as Membrane
 from .membrane.model import stretch as stretch
-from .membrane.resting import resting_cell as resting_cell
-from .mesh_series import MeshSeries as MeshSeries
+from .membrane.rest import resting_cell as resting_cell
 from .phantoms import Ball as Ball
 from .phantoms import Capsule as Capsule
 from .phantoms import Foam as Foam
@@ -44,6 +43,7 @@ from .rods import Rod as Rod
 from .rods import RodScene as RodScene
 from .rods import random_bubbles as random_bubbles
 from .scene import MeshScene as MeshScene
+from .scene import MeshSeries as MeshSeries
 from .soft_matter import body_with_absorber as body_with_absorber
 from .soft_matter import coated_droplets as coated_droplets
 from .soft_matter import round_cell as round_cell

@@ -16,8 +16,7 @@ from torch import Tensor, nn
 
 from ..beamline.grow import SeriesFolder, read_compact
 from ..checks import as_written, require
-from ..io.atomic import write_rows
-from ..io.json import read_json
+from ..io.atomic import read_json, write_rows
 from ..learning.weights import Card
 from ..motion.learned import (
     DEGREE,

@@ -10,8 +10,7 @@ from typing import Literal, Protocol
 import numpy as np
 
 from ..checks import require
-from ..io.atomic import atomic_folder
-from ..io.json import write_json
+from ..io.atomic import atomic_folder, write_json
 from ..io.nerf_synthetic import camera_poses, write_nerf_synthetic
 from ..io.r2_gaussian import R2Options, write_r2_gaussian
 from ..progress import Advance

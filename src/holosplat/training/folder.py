@@ -17,15 +17,13 @@ from torch import Tensor
 from torch.utils.data import Dataset as TorchDataset
 
 from ..checks import InputError, require
-from ..io.atomic import atomic_path
-from ..io.hdf5 import Fields, open_hdf5
-from ..io.hdf5_writing import new_hdf5
-from ..io.json import read_json, write_json
+from ..io.atomic import atomic_path, read_json, write_json
+from ..io.hdf5 import Fields, new_hdf5, open_hdf5
 from ..io.provenance import command_now, take_up
 from ..progress import Advance
 from ..tables import from_table, to_table
 from ..version import __version__
-from .ranges import Ranges
+from .options import Ranges
 from .sample import Sample, sample_of
 
 SHARD = 25

@@ -24,7 +24,7 @@ from ..specimens.red_cells import DIAMETER, evans_fung_cell
 from ..specimens.scene import MeshScene
 from ..units import wavelength
 from ..volume import Volume
-from .ranges import Kind, Ranges
+from .options import Kind, Ranges
 
 PURPOSE = 2101
 """Keeps the numbers that are drawn here apart from those that other parts draw with the same seed."""

@@ -17,8 +17,7 @@ from ..io.atomic import write_rows
 from ..learning.network import FINE, Guess, Taps
 from ..learning.start import images, unexplained
 from ..learning.weights import Card
-from .options import LossWeights, ViewSampling
-from .ranges import Ranges
+from .options import LossWeights, Ranges, ViewSampling
 from .sample import Sample, sample_of
 
 UPSIDE_DOWN = np.diag([1.0, -1.0, 1.0])

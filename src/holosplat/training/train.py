@@ -17,8 +17,7 @@ from torch.nn.utils import clip_grad_norm_
 
 from ..backends import require_device
 from ..checks import InputError, as_written, require
-from ..io.atomic import write_rows, write_state
-from ..io.json import read_json, write_json
+from ..io.atomic import read_json, write_json, write_rows, write_state
 from ..learning.network import Guess
 from ..learning.weights import Card, write_weights
 from ..tables import to_table
@@ -26,8 +25,7 @@ from ..version import source_commit
 from ..workflows.provenance import environment
 from ..workflows.run_folder import checkpoint_state
 from .folder import Dataset
-from .options import TrainOptions
-from .ranges import Ranges
+from .options import Ranges, TrainOptions
 from .sample import Sample
 from .shown import Validation, draw_example, loss
 

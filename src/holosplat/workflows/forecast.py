@@ -11,8 +11,7 @@ import torch
 from ..checks import InputError, as_written, positive, require
 from ..fit.run import Journal, Run
 from ..inference import Decision
-from ..io.atomic import write_rows
-from ..io.json import write_json
+from ..io.atomic import write_json, write_rows
 from ..io.nxtomo import write_scan
 from ..io.objects import write_object
 from ..methods.presets import SCHEMA

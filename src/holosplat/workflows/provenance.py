@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..checks import InputError, require
-from ..io.json import read_json, write_json
+from ..io.atomic import read_json, write_json
 from ..io.leftovers import files_in
 from ..io.provenance import sha256
 from ..version import __version__

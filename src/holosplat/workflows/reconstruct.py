@@ -11,13 +11,13 @@ from ..backends import in_main_memory, resolve
 from ..checks import InputError, as_written, note, positive
 from ..fit.run import Record, Run, Running
 from ..inference import Decision
-from ..io.json import write_json
+from ..io.atomic import write_json
 from ..io.light import read_still_light
 from ..io.volumes import write_guess
 from ..learning.start import GuessedMatter
 from ..matter import MaterialPrior, MatterKind
 from ..methods import Auto, Gaussians, Method, Settled, Task, finished, learned, settled
-from ..methods.first_volumes import first_picture
+from ..methods.cross_validation import first_picture
 from ..methods.illumination import prepared
 from ..methods.keeper import Keeper
 from ..methods.kinds import unseen_kinds
@@ -39,16 +39,19 @@ from .preconditions import (
     require_one_time,
 )
 from .provenance import environment, scan_hash
-from .reconstruction import Reconstruction, config_of, read_rest, write_run
-from .refine import (
+from .reconstruction import (
+    Reconstruction,
+    config_of,
     freedom_of,
     keep_geometry,
     read_geometry,
+    read_rest,
     require_compatible,
     saved_geometry,
     trained_geometry,
     with_fitted,
     with_held_out,
+    write_run,
 )
 from .run_folder import RunFolder, claimed
 from .run_illumination import fixed_pattern_of, light_options_of, read_light_options

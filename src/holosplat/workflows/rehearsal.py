@@ -21,7 +21,7 @@ from ..io.volumes import read_volume, write_volume
 from ..matter import MaterialPrior
 from ..methods import Auto, Method
 from ..metrics import robust_material_delta
-from ..optics.noise_model import NoiseModel
+from ..optics.noise import NoiseModel
 from ..progress import Progress
 from ..representations import InMotion
 from ..scan import Exposures, Scan

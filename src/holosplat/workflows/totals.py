@@ -17,7 +17,7 @@ from ..methods import Task
 from ..methods.modulation import DOUBTFUL, RATIO_SHARE, Total, total_delta
 from ..methods.uncertain import Determined
 from ..methods.volume import binning
-from ..optics.noise_model import NoiseModel
+from ..optics.noise import NoiseModel
 from ..representations import Stored, VoxelGrid
 from ..scan import Scan
 from ..units import in_percent

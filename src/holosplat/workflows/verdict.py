@@ -17,8 +17,7 @@ from ..fit.residuals import Prediction, Residuals, residuals, split_validation
 from ..fit.run import Running
 from ..methods import Task
 from ..model import LightField, Model, SolvedLight
-from ..optics.noise import noise_levels
-from ..optics.noise_model import NoiseModel
+from ..optics.noise import NoiseModel, noise_levels
 from ..representations import Stored, VoxelGrid
 from ..scan import Scan
 from ..units import in_percent, plain, two_digits

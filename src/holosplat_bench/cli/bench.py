@@ -20,7 +20,7 @@ from holosplat.ranges import Seed
 
 if TYPE_CHECKING:
     from ..suite.folder import Row
-    from ..suite.method import BenchMethod
+    from ..suite.methods import BenchMethod
     from ..suite.run import Suite
     from ..thesis.folder import StudyFolder
 
@@ -117,8 +117,8 @@ def run(
 
     from ..suite.case import case_names, load_case
     from ..suite.folder import BenchFolder
-    from ..suite.measured import MEASURED, MeasuredCase
     from ..suite.methods import ALIGNED, METHODS
+    from ..suite.prepare import MEASURED, MeasuredCase
     from ..suite.references import REFERENCES
     from ..suite.run import Suite, chosen, run_suite
 
@@ -294,7 +294,7 @@ def _outcome(row: Row) -> str:
 
 def _at_hand(sources: dict[str, str], data: Path | None) -> dict[str, str]:
     """The cases whose data are at hand; of the others it is said that they are skipped, and why."""
-    from ..suite.measured import MEASURED, missing_data
+    from ..suite.prepare import MEASURED, missing_data
 
     missing = missing_data(tuple(name for name in sources if name in MEASURED), data)
     for name, why in missing.items():

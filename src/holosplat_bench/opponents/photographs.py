@@ -20,8 +20,7 @@ from holosplat.checks import at_least, require
 from holosplat.fit.density import DensityControl, DensityEvent
 from holosplat.fit.loop import Fit, Plan, Stateless
 from holosplat.fit.optimiser import Adam, Trainable
-from holosplat.fit.problem import FIXED, Batch, LossPart, Problem
-from holosplat.fit.schedule import Schedule
+from holosplat.fit.problem import FIXED, Batch, LossPart, Problem, Schedule
 from holosplat.fit.terms import Objective
 from holosplat.geometry import Grid
 from holosplat.matter import Matter

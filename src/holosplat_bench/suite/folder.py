@@ -11,9 +11,8 @@ from typing import Any, Literal
 import numpy as np
 
 from holosplat.checks import InputError, require
-from holosplat.io.atomic import atomic_path, is_taken, require_parent
+from holosplat.io.atomic import atomic_path, is_taken, read_json, require_parent, write_json
 from holosplat.io.guard import read_archive
-from holosplat.io.json import read_json, write_json
 from holosplat.io.leftovers import is_hidden
 from holosplat.metrics.images import json_number
 

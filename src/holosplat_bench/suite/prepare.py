@@ -1,28 +1,165 @@
-"""The scan and the truth of a case, simulated once and kept."""
+"""The scan and the truth of a case, simulated once and kept; and cases of measured frames: few of many views for
+training, and filtered back-projection of all for the truth."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+import torch
 
+from holosplat.baselines.algebraic import filtered_backprojection
 from holosplat.beamline.declared.declaration import Case
-from holosplat.checks import require
-from holosplat.io.json import read_json, write_json
+from holosplat.checks import InputError, require
+from holosplat.geometry import Grid
+from holosplat.io.atomic import read_json, write_json
 from holosplat.io.nxtomo import read_scan, write_scan
+from holosplat.io.reading import Part, Reading, Told
+from holosplat.io.samples import fetched, sample
 from holosplat.io.volumes import read_volume, write_volume
+from holosplat.matter import KnownRatio
 from holosplat.scan import Scan
 from holosplat.specimens.continuous import ContinuousScene
 from holosplat.specimens.drawn import ChangingScene, Scene, Still
 from holosplat.specimens.rods import RodScene
+from holosplat.units import wavenumber
 from holosplat.volume import Volume
+from holosplat.workflows.correct import CorrectionOptions, correct
 from holosplat.workflows.provenance import scan_hash
 
-from .measured import MeasuredCase
+DARKEST = 1e-3
+"""Relative intensity below which a pixel counts as so bright: its logarithm has no meaning."""
+WITHIN = 0.45
+"""Share of the frames' width about the axis within which volumes are compared: beyond it, back-projection of all
+views has streaks of what lies outside."""
+
+
+@dataclass(frozen=True)
+class MeasuredCase:
+    """Measured frames in contact, of absorption alone.
+
+    name, summary: of the case; sample: the data's name (`holosplat data list`); reading, correction: how raw frames
+    become relative ones; every, count: training frames, one in so many and at most so many; prior: the ratio δ/β that
+    methods are told, which changes δ and no frame; folder: where the data lie (None: they are fetched). The seed is
+    that of the methods.
+    """
+
+    name: str
+    summary: str
+    sample: str
+    reading: Reading
+    correction: CorrectionOptions
+    every: int
+    count: int
+    prior: KnownRatio
+    folder: Path | None = None
+    seed: int = 0
+    balls: tuple[()] = ()
+
+    def scan(self) -> Scan:
+        """The corrected frames, those for training marked; `InputError` where the data are not at hand."""
+        source, _ = fetched(sample(self.sample), self.folder)
+        with TemporaryDirectory() as scratch:
+            out = Path(scratch) / "scan.nxs"
+            correct(source, out, self.correction, reading=self.reading)
+            scan = read_scan(out).in_memory()
+        is_test = np.ones(len(scan), dtype=bool)
+        is_test[np.arange(0, len(scan), self.every)[: self.count]] = False
+        return scan.with_split(is_test)
+
+    def truth(self) -> Volume:
+        """β by filtered back-projection of all frames, and the δ that the ratio gives it."""
+        return back_projected(self.scan(), self.prior)
+
+    def fingerprint(self) -> str:
+        """A short hash (SHA-256) of the data and of what is done with them."""
+        said = (self.reading.as_table(), self.correction, self.every, self.count, self.prior.as_dict(), self.seed)
+        return hashlib.sha256(repr((sample(self.sample).sha256, said)).encode()).hexdigest()[:16]
+
+    def described(self, scan: Scan) -> dict[str, Any]:
+        """The case in numbers, for the report."""
+        exposures, known = scan.exposures, sample(self.sample)
+        return {
+            "case": self.name,
+            "seed": self.seed,
+            "summary": self.summary,
+            "specimen": f"{known.title} ({known.source}; {known.licence}), measured; the truth is filtered "
+            "back-projection of all views",
+            "detector": list(scan.views.shape),
+            "pixel_size_m": scan.views.pixel_size,
+            "energy_kev": exposures.one_energy("a measured case"),
+            "distance_m": [float(exposures.distance.min()), float(exposures.distance.max())],
+            "psf_sigma_px": [0.0, 0.0],
+            "training_frames": int((~scan.is_test).sum()),
+            "held_out_frames": int(scan.is_test.sum()),
+            "shares_axis": scan.views.shares_axis,
+            "photons": None,
+            "light": {},
+            "prior": self.prior.as_dict(),
+        }
+
+
+def back_projected(scan: Scan, prior: KnownRatio) -> Volume:
+    """β by filtered back-projection of all frames of `scan`, and the δ that the ratio gives it."""
+    line = 2 * wavenumber(scan.exposures.one_energy("a measured case"))
+    lines, grid = -np.log(np.maximum(scan.frames, DARKEST)) / line, Grid.of_views(scan.views)
+    beta = filtered_backprojection(torch.from_numpy(lines), scan.views, grid, None, lambda done: None).numpy()
+    return Volume(prior.ratio * beta, beta, grid)
+
+
+def agreement(found: Volume, reference: Volume, rows: slice = slice(None)) -> dict[str, float]:
+    """Correlation of β with that of all views, and its slope (least squares through 0), within `WITHIN` of the axis and
+    in these rows."""
+    x, _, z = reference.grid.axes()
+    near = np.hypot(z[:, None], x[None]) < WITHIN * len(x) * reference.grid.voxel_size[0]
+    inside = np.broadcast_to(near[:, None], reference.beta.shape)
+    a, b = (volume.beta[:, rows][inside[:, rows]].astype(np.float64) for volume in (found, reference))
+    return {"correlation": float(np.corrcoef(a, b)[0, 1]), "slope": float(a @ b / (b @ b))}
+
+
+def _capsule(name: str, summary: str, crop: str | None) -> MeasuredCase:
+    told = Told(energy_kev=20.0, distance=0.0, pixel_size=42.92e-6, axis_column=42.625, sense="anticlockwise")
+    ratio = KnownRatio(500.0)
+    return MeasuredCase(
+        name, summary, "capsule", Reading(told, Part(crop=crop)), CorrectionOptions(rings=5), 8, 12, ratio
+    )
+
+
+TOOTH = Reading(Told(energy_kev=20.0, distance=0.0, pixel_size=1e-5, axis_column=147.25, sense="anticlockwise"))
+MEASURED = {
+    case.name: case
+    for case in (
+        _capsule("capsule-dome", "the soft dome of a gelatine capsule, 12 of 91 measured views", "0:28,:"),
+        _capsule("capsule", "a gelatine capsule with metal, 12 of 91 measured views", None),
+        MeasuredCase(
+            "tooth",
+            "a tooth, 15 of 181 measured views of two rows",
+            "tooth",
+            TOOTH,
+            CorrectionOptions(method="plain"),
+            12,
+            15,
+            KnownRatio(300.0),
+        ),
+    )
+}
+"""Name → case."""
+
+
+def missing_data(names: tuple[str, ...], folder: Path | None) -> dict[str, str]:
+    """What cannot be run of the measured cases `names`: name → the sentence that says why."""
+    missing = {}
+    for name in names:
+        try:
+            fetched(sample(MEASURED[name].sample), folder)
+        except InputError as error:
+            missing[name] = str(error)
+    return missing
 
 
 def prepared(case: Case | MeasuredCase, folder: Path) -> tuple[Scan, Volume]:

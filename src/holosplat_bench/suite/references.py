@@ -17,7 +17,7 @@ from holosplat.progress import Progress
 from holosplat.representations.voxels import VoxelGrid
 from holosplat.volume import Object, Volume
 
-from .measured import MeasuredCase
+from .prepare import MeasuredCase
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ import numpy as np
 from holosplat.beamline.declared.declaration import Case
 from holosplat.checks import InputError, at_least, require
 from holosplat.fit.density import DensityControl
-from holosplat.fit.schedule import Schedule
+from holosplat.fit.problem import Schedule
 from holosplat.fit.terms import Objective
 from holosplat.methods import FitOptions
 from holosplat.methods.gaussian_options import GaussianRates

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from holosplat.checks import as_written, require
-from holosplat.io.atomic import atomic_path, require_new, write_rows, write_state
+from holosplat.io.atomic import atomic_path, read_json, require_new, write_json, write_rows, write_state
 from holosplat.io.guard import read_archive
-from holosplat.io.json import read_json, write_json
 from holosplat.tables import read_rows
 from holosplat.workflows.run_folder import checkpoint_state
 

@@ -13,7 +13,7 @@ import holosplat as hs
 from helpers.unjudged import unjudged
 from holosplat.baselines import HolographicTV
 from holosplat.checks import InputError
-from holosplat.fit.schedule import Schedule
+from holosplat.fit.problem import Schedule
 from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.mesh import TriangleMesh
@@ -21,9 +21,8 @@ from holosplat.methods import HolographicVoxels, Method, Pinn, Task, VoxelFit, V
 from holosplat.methods.ground import ground
 from holosplat.representations import VoxelGrid
 from holosplat.scan import Exposures, Scan
-from holosplat.specimens.mesh_series import MeshSeries
 from holosplat.specimens.red_cells import icosphere
-from holosplat.specimens.scene import MeshScene
+from holosplat.specimens.scene import MeshScene, MeshSeries
 from holosplat.volume import Object
 from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
 from holosplat.workflows.run_folder import RunFolder

@@ -13,13 +13,11 @@ from torch import Tensor
 
 from ...progress import Advance
 from ...scan import Exposures
-from .admm import ADMM, admm
 from .bounded import FIXED, Estimate, bounded_estimate
 from .contact import absorption_alone
 from .halo import without_halo
-from .iterative import Projections, gerchberg_saxton, hybrid_input_output
 from .linear import Linear, contrast_transfer, invert_contrast, paganin, retrieve_thickness
-from .nonlinear import Tikhonov, tikhonov
+from .nonlinear import ADMM, Projections, Tikhonov, admm, gerchberg_saxton, hybrid_input_output, tikhonov
 from .spectra import Prior
 
 

@@ -1,18 +1,24 @@
-"""Nonlinear Tikhonov: the smoothest non-negative thickness that explains a frame through the full wave optics."""
+"""Retrieval of single frames through the full wave optics: the smoothest non-negative thickness (Tikhonov), total
+variation (ADMM), and alternating projections (Gerchberg–Saxton and Fienup)."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
+import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
+from ...checks import at_least
 from ...progress import Advance
 from ...ranges import Weight, checked_dataclass
 from ...scan import Exposures
+from ..propagation import exit_wave_of
 from .contact import or_in_contact
-from .model import Regularised, WaveModel, view_by_view
-from .spectra import TINY, Gaps, Noise, squared_frequency
+from .model import DARKEST, Regularised, WaveModel, view_by_view
+from .spectra import TINY, Gaps, Noise, check_noise, squared_frequency
 
 FIRST_DAMPING = 0.05
 """Damping at the start; 1 is the curvature of the strongest frequency."""
@@ -104,3 +110,240 @@ def descend(model: WaveModel, options: Tikhonov, on_progress: Advance) -> tuple[
         damping = damping * torch.where(better.cpu(), EASE, TIGHTEN)
         values.append(value)
     return phase, torch.stack(values)
+
+
+EDGE = 0.5
+"""Jumps of phase that are taken for edges within one iteration, in mean slopes of the matter."""
+COUPLING = 0.05
+"""Penalty of leaving the bounds, in the curvature of the strongest frequency."""
+
+
+@checked_dataclass
+class ADMM(Regularised):
+    """Options. iterations: updates of the multipliers; weight: of total variation, relative to the mean slope of the
+    estimate."""
+
+
+@or_in_contact
+def admm(
+    frames: Tensor,
+    exposures: Exposures,
+    delta: float,
+    beta: float,
+    *,
+    options: ADMM = ADMM(),
+    missing: Tensor | None = None,
+    two_sided: bool = False,
+    on_progress: Advance = lambda fraction: None,
+) -> Tensor:
+    """Thickness [V, H, W] in metres of one material, β of any sign, with edges: frames [V, H, W] through full waves.
+
+    `½ Σ (√I(φ) - √I)² + w TV(φ)` over phases φ = k|δ|T that are not negative (unless `two_sided`) and lie within a
+    support, split as by Goldstein & Osher (2009): slopes d = ∇φ are shrunk, a copy z = φ is bounded, and φ takes one
+    damped Newton step, which is diagonal in Fourier space. Wen et al. (2012) split at the detector instead, where the
+    amplitude has an exact proximal map; but point-spread function and pixel stand between wave and amplitude there, and
+    the phase of a wave of its own may wrap. Villanueva-Perez et al. (2017) split the linear model; this is theirs, with
+    the wave optics in its place and total variation beside the bounds.
+    """
+
+    def solve(frames: Tensor, exposures: Exposures, noise: Noise, missing: Gaps, on_progress: Advance) -> Tensor:
+        how = (options.backend, options.leaves, options.prior)
+        told = {"sign": math.copysign(1.0, delta), "missing": missing, "two_sided": two_sided}
+        model = WaveModel(frames, exposures, beta / delta, noise, *how, **told)
+        return model.thickness(_alternating_directions(model, options, on_progress), delta)
+
+    return view_by_view(frames, exposures, delta, (options.noise, missing), solve, on_progress)
+
+
+def _alternating_directions(model: WaveModel, options: ADMM, on_progress: Advance) -> Tensor:
+    """The bounded phase [V, H, W] after all iterations."""
+    phase = model.phase
+    weight, edge = _weights(model, options)
+    pull_slopes, pull_copy = weight / edge, COUPLING * model.strongest / model.oversample**2
+    like = {"device": phase.device, "dtype": phase.dtype}
+    pull, shrink, hold = pull_slopes.to(**like), edge.to(**like), pull_copy.to(**like)
+    curvature = model.curvature() + pull_slopes * _laplacian(model.raster.shape) + pull_copy
+    slopes, copy = gradient(phase), phase.clone()
+    slopes_dual, copy_dual = torch.zeros_like(slopes), torch.zeros_like(phase)
+    misfit, fall = model.misfit(phase)
+    damping = FIRST_DAMPING * model.strongest.flatten().to(misfit.dtype)
+
+    def coupled(at: Tensor) -> Tensor:
+        """The terms of the constraints in the objective [V]."""
+        away = (gradient(at) - slopes + slopes_dual).double().square().sum(dim=(0, 2, 3))
+        apart = (at - copy + copy_dual).double().square().sum(dim=(1, 2))
+        return 0.5 * (pull[:, 0, 0] * away + hold[:, 0, 0] * apart)
+
+    for done in range(options.iterations):
+        on_progress(done / options.iterations)
+        slant = fall + pull * gradient_adjoint(gradient(phase) - slopes + slopes_dual)
+        slant = slant + hold * (phase - copy + copy_dual)
+        scale = 1 / (curvature + damping[:, None, None] / model.oversample**2)
+        trial = phase - model.filter(slant, scale)
+        trial_misfit, trial_fall = model.misfit(trial)
+        better = trial_misfit + coupled(trial) <= misfit + coupled(phase)
+        chosen = better[:, None, None]
+        phase, fall = torch.where(chosen, trial, phase), torch.where(chosen, trial_fall, fall)
+        misfit = torch.where(better, trial_misfit, misfit)
+        damping = damping * torch.where(better.cpu(), EASE, TIGHTEN)
+        # The multipliers of a view whose step was refused wait for it.
+        total = gradient(phase) + slopes_dual
+        length = total.square().sum(dim=0).sqrt()
+        shrunk = total * (1 - shrink / length.clamp_min(1e-30)).clamp_min(0)
+        slopes, slopes_dual = torch.where(chosen, shrunk, slopes), torch.where(chosen, total - shrunk, slopes_dual)
+        total = phase + copy_dual
+        bounded = model.bounded(total)
+        copy, copy_dual = torch.where(chosen, bounded, copy), torch.where(chosen, total - bounded, copy_dual)
+    return copy
+
+
+def _weights(model: WaveModel, options: ADMM) -> tuple[Tensor, Tensor]:
+    """Weight of total variation and the slope [rad] that is shrunk away, both [V, 1, 1], float64.
+
+    A Laplacian prior of mean slope b weighs `σ²/4b` against roots of variance σ²/4.
+    """
+    slope = gradient(model.phase).square().sum(dim=0).sqrt().double().sum(dim=(1, 2))
+    mean = (slope / model.support.double().sum(dim=(1, 2)).clamp_min(1)).cpu().clamp_min(1e-9)
+    unexplained = model.spectra.poses.mean(model.spectra.unexplained.mean(dim=(1, 2)))
+    weight = options.weight * 0.25 * unexplained / mean / model.oversample**2
+    return weight.clamp_min(1e-12)[:, None, None], (EDGE * mean)[:, None, None]
+
+
+def gradient(images: Tensor) -> Tensor:
+    """Differences [2, V, H, W] to the next row and the next column of [V, H, W], periodic."""
+    return torch.stack((images.roll(-1, 1) - images, images.roll(-1, 2) - images))
+
+
+def gradient_adjoint(slopes: Tensor) -> Tensor:
+    """Adjoint of `gradient`: [2, V, H, W] → [V, H, W]."""
+    rows, columns = slopes
+    return rows.roll(1, 1) - rows + columns.roll(1, 2) - columns
+
+
+def _laplacian(shape: tuple[int, int]) -> Tensor:
+    """Eigenvalues [H, W//2 + 1] of `gradient_adjoint(gradient(·))`."""
+    rows, columns = (
+        torch.from_numpy(2 - 2 * np.cos(2 * np.pi * f)) for f in (np.fft.fftfreq(shape[0]), np.fft.rfftfreq(shape[1]))
+    )
+    return rows[:, None] + columns
+
+
+@checked_dataclass
+class Projections:
+    """Options of the alternating projections."""
+
+    iterations: int = 40
+    """Pairs of projections."""
+    feedback: float = 0.9
+    """Factor of the values that violate the bounds, for hybrid input–output only (Fienup 1982)."""
+    noise: Noise = None
+    """Standard deviation of the frames, or their noise model (default: estimated from them)."""
+    backend: str = "cpu"
+    """Implementation of the wave optics (see `backends`)."""
+
+    def __post_init__(self) -> None:
+        at_least(self, 1, "iterations")
+        check_noise(self.noise)
+
+
+@or_in_contact
+def gerchberg_saxton(
+    frames: Tensor,
+    exposures: Exposures,
+    delta: float,
+    beta: float,
+    *,
+    options: Projections = Projections(),
+    missing: Tensor | None = None,
+    two_sided: bool = False,
+    on_progress: Advance = lambda fraction: None,
+) -> Tensor:
+    """Thickness [V, H, W] in metres of one material, β of any sign, by alternating projections.
+
+    Gerchberg & Saxton (1972), or Fienup's (1982) error reduction: the wave in the detector plane takes the measured
+    amplitude, the wave behind the object becomes `exp(-(kβ + ikδ) T)` with T ≥ 0 (unless `two_sided`), zero outside the
+    support of `bounded_estimate`, from which it starts. Frequencies around the zeros of the response stay as they were.
+    """
+
+    def reduce(_: Tensor, projected: Tensor, model: WaveModel) -> Tensor:
+        return model.bounded(projected)
+
+    return _alternate(frames, exposures, (delta, beta), options, reduce, (missing, two_sided, on_progress))
+
+
+@or_in_contact
+def hybrid_input_output(
+    frames: Tensor,
+    exposures: Exposures,
+    delta: float,
+    beta: float,
+    *,
+    options: Projections = Projections(),
+    missing: Tensor | None = None,
+    two_sided: bool = False,
+    on_progress: Advance = lambda fraction: None,
+) -> Tensor:
+    """Thickness [V, H, W] in metres of one material, β of any sign, by Fienup's (1982) hybrid input–output.
+
+    As `gerchberg_saxton`, but where the phase φ' after the detector's projection is negative (unless `two_sided`) or
+    outside the support, the next input is `φ - 0.9 φ'`: pushed away from the violation, not set to zero. The last
+    iterate is bounded.
+    """
+
+    def push(before: Tensor, projected: Tensor, model: WaveModel) -> Tensor:
+        allowed = (projected >= model.least) & (model.support > 0)
+        return torch.where(allowed, projected, before - options.feedback * projected)
+
+    return _alternate(frames, exposures, (delta, beta), options, push, (missing, two_sided, on_progress))
+
+
+def _alternate(
+    frames: Tensor,
+    exposures: Exposures,
+    material: tuple[float, float],
+    options: Projections,
+    rule: Callable[[Tensor, Tensor, WaveModel], Tensor],
+    beside: tuple[Gaps, bool, Advance],
+) -> Tensor:
+    (delta, beta), (missing, two_sided, on_progress) = material, beside
+
+    def solve(frames: Tensor, exposures: Exposures, noise: Noise, missing: Gaps, on_progress: Advance) -> Tensor:
+        told = {"sign": math.copysign(1.0, delta), "missing": missing, "two_sided": two_sided}
+        model = WaveModel(frames, exposures, beta / delta, noise, options.backend, **told)
+        phase = model.phase
+        for done in range(options.iterations):
+            on_progress(done / options.iterations)
+            phase = rule(phase, through_detector(model, phase), model)
+        return model.thickness(model.bounded(phase), delta)
+
+    return view_by_view(frames, exposures, delta, (options.noise, missing), solve, on_progress)
+
+
+def through_detector(model: WaveModel, phase: Tensor) -> Tensor:
+    """The phase [V, H, W] nearest to the wave that has the measured amplitudes and comes from `phase` otherwise.
+
+    Beyond the frame nothing was measured, and the amplitude stays. With `U'` the new wave behind the object and U the
+    old one, `-ln(U'/U) = dℓ + i dφ` has no branch to choose as long as an iteration changes the phase by less
+    than π: a phase of many radians never wraps. The phase of one material nearest to it, in the logarithm, is
+    `φ + (dφ + r dℓ) / (1 + r²)`, `r = β/δ`. Frames of one pose give the mean of their changes.
+    """
+    path, r, sign = model.path, model.ratio, model.sign
+    transfer = path.transfer
+    before = exit_wave_of(sign * r * phase, sign * phase)
+    detector = 1 + torch.fft.ifft2(torch.fft.fft2(before) * transfer)
+    gain = _gain(model, phase)
+    after = before + torch.fft.ifft2(torch.fft.fft2((gain - 1) * detector) * transfer.conj())
+    change = (1 + after) / (1 + before)
+    loss, delay = -torch.log(change.abs().clamp_min(DARKEST)), -torch.angle(change)
+    return phase + sign * model.spectra.poses.mean((delay + r * loss) / (1 + r**2))
+
+
+def _gain(model: WaveModel, phase: Tensor) -> Tensor:
+    """Factor [V, H, W] of the amplitude on the waves' raster: measured over modelled pixels, one beyond the
+    frame and in missing pixels."""
+    (my, mx), s = model.margin, model.oversample
+    with torch.no_grad():
+        gain = model.amplitude / model.image(phase).clamp_min(DARKEST).sqrt()
+        gain = gain if model.missing is None else gain.masked_fill(model.missing, 1.0)
+    gain = pad(gain, (mx, mx, my, my), value=1.0)
+    return gain.repeat_interleave(s, 1).repeat_interleave(s, 2)

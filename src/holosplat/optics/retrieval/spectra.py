@@ -19,8 +19,7 @@ from ...checks import at_least, finite, require, shaped
 from ...ranges import Weight, checked_dataclass
 from ...scan import Exposures
 from ...units import wavelength, wavenumber
-from ..noise import noise_levels, with_gaps
-from ..noise_model import NoiseModel
+from ..noise import NoiseModel, noise_levels, with_gaps
 from ..propagation import transfer_phase
 from ..sampling import SharedPoses, smooth_margin
 

@@ -13,9 +13,8 @@ import torch
 from holosplat.baselines import HolographicTV, holographic_tv
 from holosplat.checks import InputError, at_least, require
 from holosplat.fit.loop import Fit, Plan
-from holosplat.fit.problem import Problem
+from holosplat.fit.problem import Problem, Schedule
 from holosplat.fit.projected_gradient import ProjectedGradient
-from holosplat.fit.schedule import Schedule
 from holosplat.fit.terms import Objective
 from holosplat.matter import MaterialPrior, Matter, MatterKind
 from holosplat.methods.assumed import assumed_material

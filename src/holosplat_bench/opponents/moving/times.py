@@ -13,8 +13,7 @@ from torch import Tensor
 from holosplat.checks import at_least, require
 from holosplat.fit.loop import Fit, Plan
 from holosplat.fit.optimiser import Adam
-from holosplat.fit.problem import Batch, LossPart, Problem
-from holosplat.fit.schedule import Schedule
+from holosplat.fit.problem import Batch, LossPart, Problem, Schedule
 from holosplat.fit.terms import Objective
 from holosplat.fit.terms.frames import FrameTerm
 from holosplat.fit.total_variation import total_variation

@@ -11,9 +11,8 @@ from scipy import fft
 
 from holosplat.checks import in_range, require
 from holosplat.geometry import Grid, Views
-from holosplat.io.atomic import atomic_path
+from holosplat.io.atomic import atomic_path, read_json, write_json
 from holosplat.io.guard import read_archive
-from holosplat.io.json import read_json, write_json
 from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.io.volumes import read_volume, write_volume
 from holosplat.matter import DeltaBeta
@@ -25,8 +24,7 @@ from holosplat.units import wavelength, wavenumber
 from holosplat.volume import Volume
 
 from .. import multislice
-from ..families import ENERGY, PIXEL, REFERENCE, SIMULATED, log_uniform
-from ..random_specimens import Room
+from ..families import ENERGY, PIXEL, REFERENCE, SIMULATED, Room, log_uniform
 
 FAMILIES = {
     "red-cells": "red cells",

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from holosplat.checks import require
-from holosplat.io.json import read_json, write_json
+from holosplat.io.atomic import read_json, write_json
 from holosplat.io.leftovers import RECORD
 from holosplat.metrics.images import json_number
 
