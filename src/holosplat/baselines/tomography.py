@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -49,19 +50,8 @@ class Tomography(Protocol):
         ...
 
 
-def sirt_nonnegative(
-    lines: Tensor,
-    views: Views,
-    grid: Grid,
-    upper: float | None,
-    on_progress: Advance,
-    *,
-    missing: Tensor | None = None,
-    two_sided: bool = False,
-) -> Tensor:
-    """`sirt` with the occupancy kept from going below zero, unless it is `two_sided`, which lets it run longer."""
-    options = Algebraic(sweeps=200, relaxation=1.9, nonnegative=True)
-    return sirt(lines, views, grid, upper, on_progress, options=options, missing=missing, two_sided=two_sided)
+sirt_nonnegative = partial(sirt, options=Algebraic(sweeps=200, relaxation=1.9, nonnegative=True))
+"""`sirt` with the occupancy kept from going below zero, unless it is two-sided, which lets it run longer."""
 
 
 @checked_dataclass

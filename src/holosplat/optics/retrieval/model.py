@@ -66,6 +66,24 @@ class Regularised:
         check_noise(self.noise)
 
 
+@checked_dataclass
+class Projections:
+    """Options of the alternating projections."""
+
+    iterations: int = 40
+    """Pairs of projections."""
+    feedback: float = 0.9
+    """Factor of the values that violate the bounds, for hybrid input–output only (Fienup 1982)."""
+    noise: Noise = None
+    """Standard deviation of the frames, or their noise model (default: estimated from them)."""
+    backend: str = "cpu"
+    """Implementation of the wave optics (see `backends`)."""
+
+    def __post_init__(self) -> None:
+        at_least(self, 1, "iterations")
+        check_noise(self.noise)
+
+
 class WaveModel:
     """Frames [V, h, w] as a function of the phase delay [V, H, W] in radians, `phase = k|δ|T`, on the waves' raster.
 
@@ -190,20 +208,26 @@ class WaveModel:
 def view_by_view(
     frames: Tensor,
     exposures: Exposures,
-    delta: float,
-    beside: tuple[Noise, Gaps],
-    solve: Callable[[Tensor, Exposures, Noise, Gaps, Advance], Tensor],
-    on_progress: Advance,
+    material: tuple[float, float],
+    options: Regularised | Projections,
+    solve: Callable[[WaveModel, Advance], Tensor],
+    beside: tuple[Gaps, bool, Advance],
 ) -> Tensor:
-    """`solve(frames, exposures, noise, missing, on_progress)` of views `alike`, some at a time, with frames checked;
-    beside: noise and missing pixels."""
-    (noise, missing), frames = beside, checked(frames, exposures, delta)
+    """Thickness [V, H, W] [m] by the phases that `solve(model, on_progress)` finds for views `alike`, some at a time.
+
+    material: δ and β; beside: missing pixels, whether phases are `two_sided`, and progress. The frames are checked.
+    """
+    (delta, beta), (missing, two_sided, on_progress) = material, beside
+    frames = checked(frames, exposures, delta)
+    leaves, prior = (options.leaves, options.prior) if isinstance(options, Regularised) else (NOWHERE, None)
     found, done = torch.empty_like(frames), 0
     for index in alike(exposures):
         start, share = done / len(exposures), len(index) / len(exposures)
         gaps = None if missing is None else missing[index]
-        told = (exposures[index], part_of(noise, index), gaps)
-        part = solve(frames[index], *told, lambda f, a=start, b=share: on_progress(a + b * f))
+        seen = (frames[index], exposures[index], beta / delta, part_of(options.noise, index))
+        told = {"sign": math.copysign(1.0, delta), "missing": gaps, "two_sided": two_sided}
+        model = WaveModel(*seen, options.backend, leaves, prior, **told)
+        part = model.thickness(solve(model, lambda f, a=start, b=share: on_progress(a + b * f)), delta)
         found[index] = part.to(frames.device, frames.dtype)
         done += len(index)
     on_progress(1.0)

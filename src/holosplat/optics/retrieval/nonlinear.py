@@ -5,20 +5,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from ...checks import at_least
 from ...progress import Advance
 from ...ranges import Weight, checked_dataclass
 from ...scan import Exposures
 from ..propagation import exit_wave_of
 from .contact import or_in_contact
-from .model import DARKEST, Regularised, WaveModel, view_by_view
-from .spectra import TINY, Gaps, Noise, check_noise, squared_frequency
+from .model import DARKEST, Projections, Regularised, WaveModel, view_by_view
+from .spectra import TINY, squared_frequency
 
 FIRST_DAMPING = 0.05
 """Damping at the start; 1 is the curvature of the strongest frequency."""
@@ -58,13 +58,10 @@ def tikhonov(
     lower the objective is refused, and its view is damped more.
     """
 
-    def solve(frames: Tensor, exposures: Exposures, noise: Noise, missing: Gaps, on_progress: Advance) -> Tensor:
-        how = (options.backend, options.leaves, options.prior)
-        told = {"sign": math.copysign(1.0, delta), "missing": missing, "two_sided": two_sided}
-        model = WaveModel(frames, exposures, beta / delta, noise, *how, **told)
-        return model.thickness(descend(model, options, on_progress)[0], delta)
+    def solve(model: WaveModel, on_progress: Advance) -> Tensor:
+        return descend(model, options, on_progress)[0]
 
-    return view_by_view(frames, exposures, delta, (options.noise, missing), solve, on_progress)
+    return view_by_view(frames, exposures, (delta, beta), options, solve, (missing, two_sided, on_progress))
 
 
 def penalty_weights(model: WaveModel, weight: float) -> Tensor:
@@ -146,16 +143,11 @@ def admm(
     the wave optics in its place and total variation beside the bounds.
     """
 
-    def solve(frames: Tensor, exposures: Exposures, noise: Noise, missing: Gaps, on_progress: Advance) -> Tensor:
-        how = (options.backend, options.leaves, options.prior)
-        told = {"sign": math.copysign(1.0, delta), "missing": missing, "two_sided": two_sided}
-        model = WaveModel(frames, exposures, beta / delta, noise, *how, **told)
-        return model.thickness(_alternating_directions(model, options, on_progress), delta)
-
-    return view_by_view(frames, exposures, delta, (options.noise, missing), solve, on_progress)
+    solve = partial(_alternating_directions, options)
+    return view_by_view(frames, exposures, (delta, beta), options, solve, (missing, two_sided, on_progress))
 
 
-def _alternating_directions(model: WaveModel, options: ADMM, on_progress: Advance) -> Tensor:
+def _alternating_directions(options: ADMM, model: WaveModel, on_progress: Advance) -> Tensor:
     """The bounded phase [V, H, W] after all iterations."""
     phase = model.phase
     weight, edge = _weights(model, options)
@@ -228,24 +220,6 @@ def _laplacian(shape: tuple[int, int]) -> Tensor:
     return rows[:, None] + columns
 
 
-@checked_dataclass
-class Projections:
-    """Options of the alternating projections."""
-
-    iterations: int = 40
-    """Pairs of projections."""
-    feedback: float = 0.9
-    """Factor of the values that violate the bounds, for hybrid input–output only (Fienup 1982)."""
-    noise: Noise = None
-    """Standard deviation of the frames, or their noise model (default: estimated from them)."""
-    backend: str = "cpu"
-    """Implementation of the wave optics (see `backends`)."""
-
-    def __post_init__(self) -> None:
-        at_least(self, 1, "iterations")
-        check_noise(self.noise)
-
-
 @or_in_contact
 def gerchberg_saxton(
     frames: Tensor,
@@ -268,7 +242,8 @@ def gerchberg_saxton(
     def reduce(_: Tensor, projected: Tensor, model: WaveModel) -> Tensor:
         return model.bounded(projected)
 
-    return _alternate(frames, exposures, (delta, beta), options, reduce, (missing, two_sided, on_progress))
+    solve = partial(_alternate, options, reduce)
+    return view_by_view(frames, exposures, (delta, beta), options, solve, (missing, two_sided, on_progress))
 
 
 @or_in_contact
@@ -294,29 +269,21 @@ def hybrid_input_output(
         allowed = (projected >= model.least) & (model.support > 0)
         return torch.where(allowed, projected, before - options.feedback * projected)
 
-    return _alternate(frames, exposures, (delta, beta), options, push, (missing, two_sided, on_progress))
+    solve = partial(_alternate, options, push)
+    return view_by_view(frames, exposures, (delta, beta), options, solve, (missing, two_sided, on_progress))
 
 
-def _alternate(
-    frames: Tensor,
-    exposures: Exposures,
-    material: tuple[float, float],
-    options: Projections,
-    rule: Callable[[Tensor, Tensor, WaveModel], Tensor],
-    beside: tuple[Gaps, bool, Advance],
-) -> Tensor:
-    (delta, beta), (missing, two_sided, on_progress) = material, beside
+Rule = Callable[[Tensor, Tensor, WaveModel], Tensor]
+"""(phase before, phase after the detector's projection, model) → the next phase."""
 
-    def solve(frames: Tensor, exposures: Exposures, noise: Noise, missing: Gaps, on_progress: Advance) -> Tensor:
-        told = {"sign": math.copysign(1.0, delta), "missing": missing, "two_sided": two_sided}
-        model = WaveModel(frames, exposures, beta / delta, noise, options.backend, **told)
-        phase = model.phase
-        for done in range(options.iterations):
-            on_progress(done / options.iterations)
-            phase = rule(phase, through_detector(model, phase), model)
-        return model.thickness(model.bounded(phase), delta)
 
-    return view_by_view(frames, exposures, delta, (options.noise, missing), solve, on_progress)
+def _alternate(options: Projections, rule: Rule, model: WaveModel, on_progress: Advance) -> Tensor:
+    """The bounded phase [V, H, W] after all projections."""
+    phase = model.phase
+    for done in range(options.iterations):
+        on_progress(done / options.iterations)
+        phase = rule(phase, through_detector(model, phase), model)
+    return model.bounded(phase)
 
 
 def through_detector(model: WaveModel, phase: Tensor) -> Tensor:
