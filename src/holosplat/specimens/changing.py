@@ -20,7 +20,7 @@ from ..matter import DeltaBeta
 from ..mesh import TriangleMesh
 from ..ranges import Positive, Share, Small, SomeShare, checked_dataclass
 from .continuous import random_direction, random_rotation
-from .drawn import LONG, SHARE, ChangingScene, Drawn, Substances, lathe, meshed, region
+from .drawn import LONG, SHARE, ChangingScene, Drawn, SpecimenKind, Substances, lathe, meshed, region
 from .fluids import FASTEST
 from .phantoms import Ball, unit_ball
 from .rods import Rod, RodScene
@@ -32,7 +32,7 @@ ROWS = 193
 
 
 @checked_dataclass
-class MergingDrops:
+class MergingDrops(SpecimenKind):
     """Two drops that approach, touch, and flow together into one ball, their volume and their centre kept.
 
     From contact on the surface is `Σ exp(-(|x - cᵢ| - Rᵢ)/k) = 1`, grown to the volume of both: k grows evenly, and so
@@ -40,9 +40,7 @@ class MergingDrops:
     """
 
     kind: ClassVar[str] = "merging-drops"
-    has_core: ClassVar[bool] = False
     named: ClassVar = ("water", None, None)
-    goes_on: ClassVar[bool] = False
     extent: ClassVar[float] = 0.8
     size: Small
     """Length of both drops with their gap at the first time [m]."""
@@ -128,14 +126,13 @@ def bubble_radius(gas: float, mach: float, until: float, least: float = 1e-3) ->
 
 
 @checked_dataclass
-class Collapse:
+class Collapse(SpecimenKind):
     """A bubble in a liquid jet along the rotation axis that collapses, pierced by a jet of its own from one side.
 
     Its volume is that of Keller & Miksis' bubble. The liquid keeps its volume: the jet bulges where the bubble is.
     """
 
     kind: ClassVar[str] = "collapse"
-    has_core: ClassVar[bool] = False
     named: ClassVar = ("water", None, None)
     goes_on: ClassVar[bool] = True
     extent: ClassVar[float] = 0.55
@@ -203,7 +200,7 @@ def growth_rate(wave_number: float) -> float:
 
 
 @checked_dataclass
-class PinchingJet:
+class PinchingJet(SpecimenKind):
     """A jet along the rotation axis that Rayleigh and Plateau's disturbance breaks into drops, its volume kept.
 
     The fastest wave grows from rest as `cosh ωt` until its necks close; each wave's liquid then draws together into a
@@ -211,7 +208,6 @@ class PinchingJet:
     """
 
     kind: ClassVar[str] = "pinching-jet"
-    has_core: ClassVar[bool] = False
     named: ClassVar = ("water", None, None)
     goes_on: ClassVar[bool] = True
     extent: ClassVar[float] = 0.16

@@ -1,19 +1,16 @@
 """What the kinds of matter of `specimens.fluids` and `specimens.solids` are made of: shapes, substances, and a draw.
 
 Each kind is a frozen dataclass: its parameters are the fields, with `size` [m] first and all others shares of it unless
-they say otherwise, and `drawn(substances, seed)` gives a `Drawn`. Of its class it has
-
-- `kind`: its name;
-- `has_core`: whether something else is inside the material;
-- `goes_on`: whether its matter, or the medium around it, goes on beyond the field of view;
-- `named`: names of the usual material, core and medium (None: no core; vacuum);
-- `extent`: the usual size, in units of the shorter side of the field of view.
+they say otherwise, and `drawn(substances, seed)` gives a `Drawn`. Its class has what `SpecimenKind` says, and `named`,
+the names of the usual material, core and medium (None: no core; vacuum), and `extent`, the usual size, in units of the
+shorter side of the field of view.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -28,6 +25,15 @@ from .rods import RodScene
 from .scene import MeshScene
 
 Still = MeshScene | ContinuousScene | RodScene
+
+
+class SpecimenKind:
+    """What a kind of specimen says of itself. kind: its name; has_core: whether something else is inside the material;
+    goes_on: whether its matter, or the medium around it, goes on beyond the field of view."""
+
+    kind: ClassVar[str]
+    has_core: ClassVar[bool] = False
+    goes_on: ClassVar[bool] = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from ..checks import InputError, require
 from ..mesh import TriangleMesh
 from ..ranges import Many, ManyOrNone, Share, Small, SomeShare, checked_dataclass
 from .continuous import NODES, WEIGHTS, ContinuousScene, Soft, ellipsoid
-from .drawn import LONG, SHARE, Drawn, Substances, ball_meshes, column, lathe, meshed, region
+from .drawn import LONG, SHARE, Drawn, SpecimenKind, Substances, ball_meshes, column, lathe, meshed, region
 from .phantoms import Ball
 from .rods import RodScene, random_bubbles
 
@@ -89,11 +89,10 @@ TRIES = 10_000
 
 
 @checked_dataclass
-class Bubbles:
+class Bubbles(SpecimenKind):
     """Gas bubbles in a medium that fills the field and goes on beyond it."""
 
     kind: ClassVar[str] = "bubbles"
-    has_core: ClassVar[bool] = False
     goes_on: ClassVar[bool] = True
     named: ClassVar = ("air", None, "water")
     extent: ClassVar[float] = 0.85
@@ -115,7 +114,7 @@ class Bubbles:
 
 
 @checked_dataclass
-class Cuvette:
+class Cuvette(SpecimenKind):
     """A square tube about the rotation axis, which goes on above and below: its wall, a liquid, bubbles in that.
 
     The material is the wall's, the core is the liquid, and bubbles hold what is around the tube.
@@ -148,14 +147,13 @@ class Cuvette:
 
 
 @checked_dataclass
-class Jet:
+class Jet(SpecimenKind):
     """A liquid jet along the rotation axis, which swells and narrows as Rayleigh's disturbance makes it, with bubbles.
 
     It goes on above and below. Bubbles hold what is around the jet.
     """
 
     kind: ClassVar[str] = "jet"
-    has_core: ClassVar[bool] = False
     goes_on: ClassVar[bool] = True
     named: ClassVar = ("water", None, None)
     extent: ClassVar[float] = 0.45
@@ -187,7 +185,7 @@ class Jet:
 
 
 @checked_dataclass
-class BreakUp:
+class BreakUp(SpecimenKind):
     """Threads of liquid along the rotation axis that broke up into drops, satellites and ligaments.
 
     A thread of radius a breaks at `waves` wavelengths of λ = 9.02 a. Each wave's volume π a² λ becomes a drop,
@@ -195,8 +193,6 @@ class BreakUp:
     """
 
     kind: ClassVar[str] = "break-up"
-    has_core: ClassVar[bool] = False
-    goes_on: ClassVar[bool] = False
     named: ClassVar = ("water", None, None)
     extent: ClassVar[float] = 0.82
     size: Small
@@ -267,14 +263,13 @@ class BreakUp:
 
 
 @checked_dataclass
-class Shock:
+class Shock(SpecimenKind):
     """A decaying spherical shock in a medium that fills the field: a jump, compression, rarefaction, and its bubble.
 
     δ and β of the medium rise by `jump` at the front (`specimens.fluids`); the material fills the bubble in its middle.
     """
 
     kind: ClassVar[str] = "shock"
-    has_core: ClassVar[bool] = False
     goes_on: ClassVar[bool] = True
     named: ClassVar = ("air", None, "water")
     extent: ClassVar[float] = 0.8

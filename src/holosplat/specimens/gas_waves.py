@@ -12,7 +12,7 @@ import numpy as np
 from ..checks import require
 from ..ranges import Positive, Share, Small, SomeShare, checked_dataclass
 from .continuous import ContinuousScene, Soft, ellipsoid, random_direction
-from .drawn import SHARE, ChangingScene, Drawn, Substances
+from .drawn import SHARE, ChangingScene, Drawn, SpecimenKind, Substances
 
 COURANT = 0.4
 """Part of a cell that the fastest wave crosses in a step; the scheme is stable up to a half."""
@@ -107,7 +107,7 @@ WATER = Fluid(4.4, 1 / 4.4)
 
 
 @checked_dataclass
-class ExpandingShock:
+class ExpandingShock(SpecimenKind):
     """A spherical shock in a medium that fills the field, from a core that is suddenly hot, as by a laser's focus.
 
     Euler's equations of a stiffened gas, whose waves are those of water: the front, what it compresses, and the
@@ -115,7 +115,6 @@ class ExpandingShock:
     """
 
     kind: ClassVar[str] = "expanding-shock"
-    has_core: ClassVar[bool] = False
     goes_on: ClassVar[bool] = True
     named: ClassVar = ("water", None, "water")
     extent: ClassVar[float] = 0.85

@@ -15,6 +15,7 @@ from .drawn import (
     LONG,
     SHARE,
     Drawn,
+    SpecimenKind,
     Substances,
     ball_meshes,
     box_mesh,
@@ -35,11 +36,10 @@ MODES = 60
 
 
 @checked_dataclass
-class Crack:
+class Crack(SpecimenKind):
     """A penny-shaped crack with rough faces in a block that is larger than the field."""
 
     kind: ClassVar[str] = "crack"
-    has_core: ClassVar[bool] = False
     goes_on: ClassVar[bool] = True
     named: ClassVar = ("air", None, "PMMA")
     extent: ClassVar[float] = 0.8
@@ -72,14 +72,13 @@ class Crack:
 
 
 @checked_dataclass
-class Keyhole:
+class Keyhole(SpecimenKind):
     """The vapour cavity of a laser weld in a square bar, which goes on below, with pores behind it.
 
     The beam comes from above (-y). Cavity and pores hold what is around the bar.
     """
 
     kind: ClassVar[str] = "keyhole"
-    has_core: ClassVar[bool] = False
     goes_on: ClassVar[bool] = True
     named: ClassVar = ("titanium", None, None)
     extent: ClassVar[float] = 0.6
@@ -121,12 +120,10 @@ class Keyhole:
 
 
 @checked_dataclass
-class Lattice:
+class Lattice(SpecimenKind):
     """A cube of body-centred cubic unit cells, whose struts lead from the corners to the middle of each."""
 
     kind: ClassVar[str] = "lattice"
-    has_core: ClassVar[bool] = False
-    goes_on: ClassVar[bool] = False
     named: ClassVar = ("PMMA", None, None)
     extent: ClassVar[float] = 0.6
     size: Small
@@ -155,11 +152,10 @@ class Lattice:
 
 
 @checked_dataclass
-class Fibres:
+class Fibres(SpecimenKind):
     """Thin straight fibres about the direction of the rotation axis, which go on above and below."""
 
     kind: ClassVar[str] = "fibres"
-    has_core: ClassVar[bool] = False
     goes_on: ClassVar[bool] = True
     named: ClassVar = ("nylon", None, None)
     extent: ClassVar[float] = 0.85
@@ -186,7 +182,7 @@ class Fibres:
 
 
 @checked_dataclass
-class Channel:
+class Channel(SpecimenKind):
     """A channel along the rotation axis in a block that is larger than the field: three materials.
 
     The medium is the block's, the material is the liquid in the channel, and the core that of the red cells in it.
@@ -218,15 +214,13 @@ class Channel:
 
 
 @checked_dataclass
-class Star:
+class Star(SpecimenKind):
     """A Siemens star in a plane that holds the rotation axis: wedges with gaps as wide, which shows the resolution.
 
     Along the axis and across it the period at the radius r is 2π r / `spokes`.
     """
 
     kind: ClassVar[str] = "star"
-    has_core: ClassVar[bool] = False
-    goes_on: ClassVar[bool] = False
     named: ClassVar = ("PMMA", None, None)
     extent: ClassVar[float] = 0.85
     size: Small

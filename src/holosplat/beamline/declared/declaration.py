@@ -221,7 +221,7 @@ class Declaration:
     @property
     def goes_on(self) -> bool:
         """Whether the matter, or its medium, goes on beyond the field of view, and is meant to."""
-        return not isinstance(self.specimen, Meshed | Continuous) and self.specimen.goes_on
+        return self.specimen.goes_on
 
     def _delta_beta(self, substance: Substance) -> DeltaBeta:
         return substance.delta_beta(self.beam.energy_kev)

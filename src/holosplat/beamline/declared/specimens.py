@@ -16,21 +16,22 @@ from ...matter import DeltaBeta
 from ...mesh import TriangleMesh
 from ...ranges import Many, ManyOrNone, Metres, Seed, Share, Small, SomeShare, checked_dataclass
 from ...specimens.continuous import ContinuousScene
+from ...specimens.drawn import SpecimenKind
 from ...specimens.matter import FieldMatter
 from ...specimens.phantoms import Ball, place_capsules, random_foam, star_of_balls
 from ...specimens.red_cells import crowded_cells, random_cells
 from ...specimens.repair import closed
 from ...specimens.soft_matter import body_with_absorber, coated_droplets, round_cell, shepp_logan, soft_cells, tissue
 
+Extents = tuple[Small, Small, Small]
 """`(x, y, z)` [m]."""
 
 
 @checked_dataclass
-class SoftCells:
+class SoftCells(SpecimenKind):
     """`soft_cells`: `count` of them, the smallest and the largest of `diameters` [m], edges `edge` wide [m]."""
 
     kind: ClassVar[str] = "soft cells"
-    has_core: ClassVar[bool] = False
     count: Many
     diameters: tuple[Small, Small]
     box: Extents
@@ -43,11 +44,10 @@ class SoftCells:
 
 
 @checked_dataclass
-class RoundCell:
+class RoundCell(SpecimenKind):
     """`round_cell` of `diameter` [m]."""
 
     kind: ClassVar[str] = "round cell"
-    has_core: ClassVar[bool] = False
     diameter: Small
 
     def continuous(self, seed: int, matter: Sequence[DeltaBeta]) -> tuple[ContinuousScene, str]:
@@ -56,11 +56,10 @@ class RoundCell:
 
 
 @checked_dataclass
-class Tissue:
+class Tissue(SpecimenKind):
     """`tissue`: a piece in the ellipsoid of extents `box` [m], with so many `cells` and `granules`."""
 
     kind: ClassVar[str] = "tissue"
-    has_core: ClassVar[bool] = False
     box: Extents
     cells: ManyOrNone = 40
     granules: ManyOrNone = 300
@@ -71,11 +70,10 @@ class Tissue:
 
 
 @checked_dataclass
-class SheppLogan:
+class SheppLogan(SpecimenKind):
     """`shepp_logan` of `height` [m], edges `edge` wide [m]; the seed changes nothing."""
 
     kind: ClassVar[str] = "head phantom"
-    has_core: ClassVar[bool] = False
     height: Small
     edge: Metres = 0.0
 
@@ -85,7 +83,7 @@ class SheppLogan:
 
 
 @checked_dataclass
-class CoatedDroplets:
+class CoatedDroplets(SpecimenKind):
     """`coated_droplets`: `count` of them, the smallest and largest of `diameters` [m], `coating` thick [m]; their
     coating is the case's material, and what is in them is its core."""
 
@@ -104,7 +102,7 @@ class CoatedDroplets:
 
 
 @checked_dataclass
-class BodyWithAbsorber:
+class BodyWithAbsorber(SpecimenKind):
     """`body_with_absorber`: a body of extents `size` [m], and in it `beads` of the case's core, of diameter `bead`."""
 
     kind: ClassVar[str] = "body with absorber"
@@ -124,10 +122,6 @@ Continuous = SoftCells | RoundCell | Tissue | SheppLogan | CoatedDroplets | Body
 """Every continuous kind that a case's file may declare."""
 
 
-Extents = tuple[Small, Small, Small]
-"""`(x, y, z)` [m]."""
-
-
 @dataclass(frozen=True, eq=False)
 class Bodies:
     """Meshes about the rotation axis: `outer` are filled with the case's material, `cores` with its core's instead.
@@ -142,7 +136,7 @@ class Bodies:
 
 
 @checked_dataclass
-class RedCells:
+class RedCells(SpecimenKind):
     """`random_cells`: `count` cells of `diameter` [m] in the channel `box` [m], of the given `shape`, `deform` and
     `stretch` (without it: as `deform`).
 
@@ -150,7 +144,6 @@ class RedCells:
     """
 
     kind: ClassVar[str] = "red cells"
-    has_core: ClassVar[bool] = False
     count: Many
     diameter: Small
     box: Extents
@@ -168,11 +161,10 @@ class RedCells:
 
 
 @checked_dataclass
-class CrowdedCells:
+class CrowdedCells(SpecimenKind):
     """`crowded_cells`: cells of `diameter` [m] that fill the fraction `haematocrit` of a cylinder in `box` [m]."""
 
     kind: ClassVar[str] = "crowded cells"
-    has_core: ClassVar[bool] = False
     haematocrit: SomeShare
     diameter: Small
     box: Extents
@@ -186,14 +178,13 @@ class CrowdedCells:
 
 
 @checked_dataclass
-class Snapshots:
+class Snapshots(SpecimenKind):
     """One snapshot of simulated cells, `*_000.vtk`, `*_001.vtk` … in a folder (µm), enlarged by `scale`.
 
     The seed counts through the snapshots, and starts again after the last.
     """
 
     kind: ClassVar[str] = "snapshots"
-    has_core: ClassVar[bool] = False
     scale: float = 1.0
 
     def __post_init__(self) -> None:
@@ -217,7 +208,7 @@ class Snapshots:
 
 
 @checked_dataclass
-class Capsules:
+class Capsules(SpecimenKind):
     """`place_capsules`: `count` of them, the smallest and largest of `diameters` [m], of the thickness `shell` [m]."""
 
     kind: ClassVar[str] = "capsules"
@@ -237,7 +228,7 @@ class Capsules:
 
 
 @checked_dataclass
-class FoamDrop:
+class FoamDrop(SpecimenKind):
     """`random_foam`: a drop of diameter `drop` [m], `count` bubbles of log-normal diameters about `median` [m]."""
 
     kind: ClassVar[str] = "foam"
@@ -255,11 +246,10 @@ class FoamDrop:
 
 
 @checked_dataclass
-class BallStar:
+class BallStar(SpecimenKind):
     """`star_of_balls`: `2 · spokes` balls of each of the `diameters` [m], on rings that shrink as the balls do."""
 
     kind: ClassVar[str] = "star of balls"
-    has_core: ClassVar[bool] = False
     diameters: tuple[Small, ...]
     spokes: Many = 8
 
