@@ -24,8 +24,7 @@ import holosplat as hs
 from holosplat.beamline.record import RecordingOptions, record
 from holosplat.io.raw_file import PROJECTION
 from holosplat.io.scan_file import open_scan
-from holosplat.optics.camera import Camera, spread
-from holosplat.optics.illumination import Illumination
+from holosplat.optics.camera import Camera, Illumination, spread
 from holosplat.workflows.correct import CorrectionOptions, FlatFielding, correct
 
 PIXEL = {"3.2 µm": 3.2e-6, "0.5 µm": 0.5e-6}

@@ -14,8 +14,7 @@ from holosplat.baselines import TOMOGRAPHIES
 from holosplat.beamline.simulate import simulate
 from holosplat.fit.problem import Batch
 from holosplat.fit.residuals import Prediction, residuals
-from holosplat.fit.terms.frames import FrameTerm
-from holosplat.fit.terms.objective import Objective
+from holosplat.fit.terms.frames import FrameTerm, Objective
 from holosplat.fit.whitened import WhitenedFrames
 from holosplat.geometry import Grid, Views
 from holosplat.io.formats import read_as, read_frames

@@ -10,7 +10,7 @@ from decimal import ROUND_HALF_UP, Decimal
 from pathlib import Path
 
 from holosplat_bench.suite.case import case_names
-from holosplat_bench.suite.references import REFERENCES
+from holosplat_bench.suite.methods import REFERENCES
 
 BENCH = "holosplat bench run --out bench --snapshots DIR --seeds 101 102, then python docs/figures.py benchmark bench"
 

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from holosplat.checks import InputError
+from holosplat.cli.convert import OneMaterial
 from holosplat.cli.options import BeamlineOptions, MaterialOptions
-from holosplat.cli.retrieve import OneMaterial
 from holosplat.geometry import Views
 from holosplat.io.formats import loader_of, read, read_as
 from holosplat.io.nxtomo import write_scan

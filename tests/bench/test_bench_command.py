@@ -82,7 +82,7 @@ def shop(recorder, monkeypatch) -> Recorder:
     methods = {name: recorder.method(name) for name in ("one", "two")}
     monkeypatch.setattr("holosplat_bench.suite.methods.METHODS", methods)
     monkeypatch.setattr("holosplat_bench.suite.methods.ALIGNED", {})
-    monkeypatch.setattr("holosplat_bench.suite.references.REFERENCES", {})
+    monkeypatch.setattr("holosplat_bench.suite.methods.REFERENCES", {})
     monkeypatch.setattr("holosplat_bench.suite.case.case_names", lambda: list(SHAPES))
 
     def load(name, seed, snapshots):

@@ -14,7 +14,7 @@ from holosplat.geometry import Grid, Views
 from holosplat.projectors.voxels import SliceProjector
 from holosplat.units import wavenumber
 from holosplat.volume import Volume
-from holosplat_bench.suite import measured
+from holosplat_bench.suite import prepare
 from holosplat_bench.suite.folder import BenchFolder
 from holosplat_bench.suite.methods import METHODS
 from holosplat_bench.suite.prepare import MEASURED, agreement, missing_data
@@ -37,7 +37,7 @@ def case(tmp_path: Path, monkeypatch):
     angles = np.arange(COUNT) * 180 / COUNT
     path = tmp_path / "raw.npz"
     np.savez(path, counts=counts, flat=np.full(SHAPE, 5100.0), dark=np.full(SHAPE, 100.0), angles_deg=angles)
-    monkeypatch.setattr(measured, "fetched", lambda wanted, folder: (path, []))
+    monkeypatch.setattr(prepare, "fetched", lambda wanted, folder: (path, []))
     told = replace(MEASURED["capsule"].reading.told, axis_column=20.0)
     reading = replace(MEASURED["capsule"].reading, told=told)
     plain = replace(MEASURED["capsule"].correction, rings=None, normalise="none")

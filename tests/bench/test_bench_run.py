@@ -20,10 +20,10 @@ from holosplat.optics.sampling import fringe_sampling
 from holosplat.representations.voxels import VoxelGrid
 from holosplat.specimens.phantoms import star_of_balls
 from holosplat.workflows.evaluate import score_object
-from holosplat_bench.suite import references, run
+from holosplat_bench.suite import methods, run
 from holosplat_bench.suite.folder import BenchFolder, Row, read_row, write_row
+from holosplat_bench.suite.methods import REFERENCES
 from holosplat_bench.suite.prepare import fingerprint, prepared
-from holosplat_bench.suite.references import REFERENCES
 from holosplat_bench.suite.run import Suite, contrast_by_size, run_suite
 
 pytestmark = pytest.mark.usefixtures("unjudged_runs")
@@ -293,13 +293,13 @@ def test_true_lines_are_the_true_thickness(monkeypatch):
         given.update(lines=lines, views=views, upper=upper)
         return torch.zeros(grid.shape)
 
-    monkeypatch.setitem(references.TOMOGRAPHIES, "tv", tomography)
+    monkeypatch.setitem(methods.TOMOGRAPHIES, "tv", tomography)
     case = make_case("wide", 3)
-    found = references.tv_of_true_lines(case, case.truth(), lambda stage, fraction: None)
+    found = methods.tv_of_true_lines(case, case.truth(), lambda stage, fraction: None)
     assert found.matter == Matter.one(*MATERIAL)
     assert len(given["views"]) == 4
     assert given["upper"] == 1
     volume = case.scene.meshes[0].volume
     assert given["lines"].sum(dim=(1, 2)).numpy() * PITCH**2 == pytest.approx(volume, rel=0.01)
     with pytest.raises(hs.InputError, match="known material"):
-        references.tv_of_true_lines(replace(case, prior=hs.MaterialPrior.unknown()), case.truth(), lambda s, f: None)
+        methods.tv_of_true_lines(replace(case, prior=hs.MaterialPrior.unknown()), case.truth(), lambda s, f: None)

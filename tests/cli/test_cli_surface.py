@@ -178,7 +178,7 @@ def test_ctrl_c_leaves_nothing(shop, tmp_path, monkeypatch):
     def interrupted(*arguments: object) -> None:
         signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr("holosplat.cli.surface.refine_surfaces", interrupted)
+    monkeypatch.setattr("holosplat.cli.track.refine_surfaces", interrupted)
     outcome = holosplat("surface", shop / "run", "--out", tmp_path / "bodies")
     assert outcome.code == 130
     assert "interrupted" in outcome.err

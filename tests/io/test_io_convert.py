@@ -20,9 +20,15 @@ from scipy.spatial.transform import Rotation
 from holosplat.checks import InputError
 from holosplat.geometry import Views, rotation_y
 from holosplat.io.images import read_tiff, write_tiff
-from holosplat.io.nerf_synthetic import GivenOptics, NerfOptions, read_nerf_synthetic, write_nerf_synthetic
+from holosplat.io.nerf_synthetic import (
+    GivenOptics,
+    NerfOptions,
+    hull_points,
+    read_nerf_synthetic,
+    uniform_points,
+    write_nerf_synthetic,
+)
 from holosplat.io.nxtomo import read_scan, write_scan
-from holosplat.io.seeds import hull_points, uniform_points
 from holosplat.scan import Exposures, Scan
 
 N, H, W = 6, 7, 10

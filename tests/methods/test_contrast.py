@@ -12,9 +12,9 @@ from holosplat.geometry import Grid, Views
 from holosplat.inference import Score
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import METHODS, PerView, Task
-from holosplat.methods.contrast import ABOVE, BELOW, STAGE, decide_sign
 from holosplat.methods.illumination import prepared
 from holosplat.methods.method import first_of_task
+from holosplat.methods.trials import ABOVE, BELOW, SIGN, decide_sign
 from holosplat.metrics import volume_scores
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens import MeshScene, RodScene, random_bubbles
@@ -52,7 +52,7 @@ def cells() -> Scan:
 def test_holes_are_taken_where_they_predict_unseen_frames(prior, holes):
     """And what is decided later is decided of holes; the run's folder keeps it."""
     task = prepared(Task(holes.train(), prior))
-    (sign,) = (each for each in task.decisions if each.name == STAGE)
+    (sign,) = (each for each in task.decisions if each.name == SIGN)
     assert sign.choice == BELOW
     assert sign.compared[0].gain > 0.2
     assert task.prior == prior.signed(-1)
@@ -66,7 +66,7 @@ def test_holes_are_taken_where_they_predict_unseen_frames(prior, holes):
 
 def test_bodies_stay_bodies(cells):
     task = prepared(Task(cells.train(), MaterialPrior.of_ratio(1500)))
-    (sign,) = (each for each in task.decisions if each.name == STAGE)
+    (sign,) = (each for each in task.decisions if each.name == SIGN)
     assert sign.choice == ABOVE
     assert sign.compared[0].loses
     assert task.prior.delta_sign == 1.0

@@ -11,7 +11,7 @@ from holosplat.geometry import Views
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import Auto, Task
 from holosplat.methods.cross_validation import BY_VIEWS
-from holosplat.methods.kinds import decide_kind, unseen_kinds
+from holosplat.methods.trials import decide_kind, unseen_kinds
 from holosplat.representations import GaussianCloud, SurfaceMesh
 from holosplat.scan import Exposures
 from holosplat.specimens.red_cells import random_cells

@@ -16,11 +16,10 @@ from holosplat.geometry import Grid, Views
 from holosplat.inference import Score
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import METHODS, SmoothVolume, Task
-from holosplat.methods.contrast import ABOVE, BOTH, STAGE, decide_sides
 from holosplat.methods.illumination import decided, prepared
 from holosplat.methods.method import first_of_task
 from holosplat.methods.start import starting_cloud
-from holosplat.methods.trials import WITHOUT, Trials
+from holosplat.methods.trials import ABOVE, BOTH, SIGN, WITHOUT, Trials, decide_sides
 from holosplat.optics.background import LightOptions
 from holosplat.optics.retrieval import RETRIEVALS, tikhonov
 from holosplat.scan import Exposures, Scan
@@ -155,7 +154,7 @@ def test_gaussians_are_of_the_sides_that_a_start_finds(pair):
 def test_both_sides_are_taken_where_they_predict_unseen_frames(scan):
     first = first_of_task(Task(scan, MaterialPrior.of_ratio(WATER.ratio).signed(-1)))
     found, decision = decide_sides(first, LightOptions())
-    assert decision.name == STAGE
+    assert decision.name == SIGN
     assert decision.choice == BOTH
     assert found.prior.two_sided
     assert found.prior.sign == -1

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from holosplat.checks import InputError
-from holosplat.optics.camera import Camera, Sensor, spread
-from holosplat.optics.illumination import Illumination, PulseModel
+from holosplat.optics.camera import Camera, Illumination, PulseModel, Sensor, spread
 
 EVEN = {"gain_spread": 0.0, "offset_spread": 0.0, "dead": 0.0, "hot": 0.0}
 SHAPE = (151, 200)

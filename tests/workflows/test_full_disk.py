@@ -14,7 +14,7 @@ import pytest
 
 from holosplat.checks import InputError
 from holosplat.cli.align import _write_table
-from holosplat.cli.retrieve import _preview
+from holosplat.cli.convert import _preview
 from holosplat.geometry import Views
 from holosplat.io import write_scan
 from holosplat.io.atomic import atomic_folder, atomic_path

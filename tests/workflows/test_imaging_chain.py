@@ -22,8 +22,7 @@ from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.io.raw_file import DARK, FLAT, PROJECTION
 from holosplat.io.scan_file import open_scan
 from holosplat.io.vtk import write_mesh
-from holosplat.optics.camera import Camera
-from holosplat.optics.illumination import Illumination
+from holosplat.optics.camera import Camera, Illumination
 from holosplat.scan import Scan
 from holosplat.workflows.correct import CorrectionOptions, correct
 from holosplat.workflows.join import join

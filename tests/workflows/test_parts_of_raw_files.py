@@ -13,8 +13,7 @@ from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.io.raw_file import PROJECTION
 from holosplat.io.reading import Part, Reading, Told
 from holosplat.io.scan_file import open_scan
-from holosplat.optics.camera import Camera
-from holosplat.optics.illumination import Illumination
+from holosplat.optics.camera import Camera, Illumination
 from holosplat.workflows.correct import CorrectionOptions, correct
 from holosplat.workflows.join import join
 

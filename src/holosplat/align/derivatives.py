@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from ..baselines.wave_frames import frames_of
+from ..baselines.rays import frames_of
 from ..geometry import Grid, Views
 from ..matter import DeltaBeta
 from ..model import Instrument

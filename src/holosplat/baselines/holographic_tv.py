@@ -34,9 +34,8 @@ from ..ranges import Metres, Weight, checked_dataclass
 from ..scan import Scan
 from .beyond import Margins, carried_on, columns_beyond, rows_beyond, unseen_rays
 from .primal_dual import PrimalDual
-from .rays import photons_left, rays_of
+from .rays import frames_of, photons_left, rays_of, refined
 from .tomography import TotalVariation, tv_solver
-from .wave_frames import frames_of, refined
 
 IN_NOISE = 1.0
 """Weight of total variation in rounds of agreement with noisy frames [pixels of path length]: 0.3 left up to a half

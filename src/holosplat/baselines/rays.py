@@ -1,4 +1,5 @@
-"""A tomographic problem in pixels: line integrals of thickness, and the projector that explains them."""
+"""A tomographic problem in pixels: line integrals of thickness, and the projector that explains them; frames of a
+projected thickness through the waves."""
 
 from __future__ import annotations
 
@@ -7,15 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate
+from torch.nn.functional import interpolate, pad
 
 from ..backends import device
 from ..checks import InputError, require
 from ..geometry import Grid, Views
 from ..matter import DeltaBeta
+from ..model import Instrument
 from ..projectors.voxels import Projector, projector_for
 from ..scan import Exposures
 from ..units import wavenumber
+from ..volume import LineIntegrals
 
 EVEN = 0.5
 """Share of the light that all rays must pass for their weights to be taken as equal."""
@@ -99,3 +102,20 @@ def checked_upper(upper: float | None) -> float | None:
     if upper is not None and not (np.isfinite(upper) and upper > 0):
         raise InputError(f"the upper bound of the occupancy must be a positive number, or None, but it is {upper:g}.")
     return upper
+
+
+def frames_of(instrument: Instrument, lines: Tensor, material: DeltaBeta) -> Tensor:
+    """Frames from thickness [V, H, W] in metres on the unpadded raster, or on a larger one about the same middle.
+
+    Matter outside it counts as none.
+    """
+    rows, columns = ((n - seen) // 2 for n, seen in zip(instrument.views.shape, lines.shape[1:]))
+    padded = pad(lines, (columns, columns, rows, rows))  # below 0 it cuts
+    return instrument.frames(LineIntegrals(padded[:, None], ((material.delta, material.beta),)))
+
+
+def refined(images: Tensor, factor: int) -> Tensor:
+    """Images [V, H, W] on a raster `factor` times finer."""
+    if factor == 1:
+        return images
+    return interpolate(images[None], scale_factor=factor, mode="bilinear", align_corners=False)[0]

@@ -15,9 +15,8 @@ from ..io.nxtomo import RawLayout, scan_writer
 from ..io.raw_file import DARK, FLAT, PROJECTION
 from ..io.reading import Part
 from ..io.scan_file import open_scan
-from ..optics.camera import Camera, Sensor
+from ..optics.camera import Camera, Illumination, PulseModel, Pulses, Sensor
 from ..optics.coherence import joined_blur_px
-from ..optics.illumination import Illumination, PulseModel, Pulses
 from ..optics.noise import PHOTON_RANGE
 from ..optics.resampling import FLIPS, Flip
 from ..progress import Advance

@@ -15,8 +15,7 @@ from .light import Degrees, LightFlags, Pixels, Share
 from .options import MaterialOptions, PriorOptions
 from .places import Output
 from .progress import ProgressBar
-from .room import tell_frames
-from .sentence import put, say
+from .sentence import put, say, tell_frames
 
 if TYPE_CHECKING:
     import numpy as np

@@ -17,8 +17,7 @@ from .light import RunLightFlags
 from .options import BeamlineOptions, MethodOptions, PriorOptions
 from .places import Output
 from .progress import ProgressBar
-from .room import tell_frames, tell_reconstruction
-from .sentence import INTERRUPTED, put, say
+from .sentence import INTERRUPTED, put, say, tell_frames, tell_reconstruction
 from .simulate import TruthOptions
 from .view import LiveFlags, watched
 

@@ -50,10 +50,10 @@ GROUPS: dict[str, dict[str, str]] = {
         "run": "pipeline",
         "calibrate": "align",
         "align": "align",
-        "retrieve": "retrieve",
+        "retrieve": "convert",
         "reconstruct": "commands",
         "track": "track",
-        "surface": "surface",
+        "surface": "track",
     },
     "Look": {
         "evaluate": "commands",

@@ -220,7 +220,7 @@ def _export_splats(result: Reconstruction, out: Path) -> None:
 def _export_bodies(one: Moment, out: Path) -> None:
     from ..io.solids import write_glb, write_stl
     from ..io.vti import write_vtu
-    from .surface import write_bodies
+    from .track import write_bodies
 
     found = one.result.object
     if one.bodies is None:
@@ -270,7 +270,7 @@ def _export_volume(
     from ..scan import PIXEL_RANGE_M
     from ..workflows.export import export as write
     from ..workflows.rehearsal import matter_of
-    from .room import tell
+    from .sentence import tell
 
     shape, voxel_size = sampling
     with as_written(folder.summary, "what reconstruct wrote"):

@@ -43,8 +43,7 @@ from ..workflows.run_folder import RunFolder, claimed
 from ..workflows.track import COLLECTION, TRACKS
 from .places import Output
 from .progress import ProgressBar
-from .room import tell
-from .sentence import interruptible, put, say
+from .sentence import interruptible, put, say, tell
 
 
 @checked_dataclass

@@ -13,8 +13,7 @@ from ..specimens.membrane.rest import nodes_of
 from ..units import in_percent
 from .places import Output
 from .progress import ProgressBar
-from .room import tell
-from .sentence import interruptible, say
+from .sentence import interruptible, say, tell
 
 
 def grow(out: Output, what: Growth, resume: bool = False) -> None:

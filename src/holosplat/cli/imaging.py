@@ -10,8 +10,7 @@ from tyro.conf import Positional
 from ..beamline.record import RecordingOptions
 from ..beamline.record import record as record_file
 from ..io.reading import Part, Reading
-from ..optics.camera import Camera
-from ..optics.illumination import Illumination
+from ..optics.camera import Camera, Illumination
 from ..optics.resampling import Flip
 from ..units import span
 from ..workflows.correct import FAR, Corrected, CorrectionOptions

@@ -11,8 +11,7 @@ from ..ranges import Jobs, Seed, Within
 from ..training.options import Ranges, TrainOptions
 from .places import Kept, Output
 from .progress import ProgressBar
-from .room import tell
-from .sentence import interruptible
+from .sentence import interruptible, tell
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -23,8 +23,7 @@ from .options import (
 )
 from .places import Output
 from .progress import ProgressBar
-from .room import tell_simulation
-from .sentence import say
+from .sentence import say, tell_simulation
 from .specimen import NO_SPECTRUM, SourceOptions, SpecimenOptions
 
 if TYPE_CHECKING:

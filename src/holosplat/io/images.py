@@ -23,10 +23,9 @@ from ..scan import Scan
 from .angles import angles_of, in_order, read_angles, tell_angles
 from .atomic import atomic_folder, write_json
 from .leftovers import is_hidden
-from .light_frames import light_frames
 from .raw_file import DARK, FLAT, NOTHING, PROJECTION, RAW_TAKES, Loader, ScanFile
 from .stacks import IMAGES, ImageStack, all_images, images_in, stack_of
-from .stored_frames import reader
+from .stored_frames import light_frames, reader
 from .table import Table, beam_table, exposure_table, read_exposures
 
 FIELDS = {FLAT: "flat|white|open_?beam|bright|refs?(?![a-z])|refhst", DARK: "dark"}

@@ -22,8 +22,8 @@ from ..units import wavenumber
 from ..volume import Volume
 from .atomic import atomic_folder, write_json
 from .guard import read_array
+from .nerf_synthetic import hull_points
 from .raw_file import Loader, folder_with, stand_in
-from .seeds import hull_points
 from .table import Table, beam_table, exposure_table, in_order, read_exposures
 
 FORMAT = "holosplat R2-Gaussian 1"

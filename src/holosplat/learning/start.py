@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
-from ..baselines.wave_frames import frames_of, refined
+from ..baselines.rays import frames_of, refined
 from ..geometry import Grid, Views
 from ..matter import DeltaBeta
 from ..model import Instrument

@@ -16,9 +16,9 @@ from ..tables import to_table
 from .auto import Auto
 from .gaussians import Gaussians
 from .illumination import prepared
-from .kinds import unseen_kinds
 from .levels import LEVELS, NAME, decide_matter, kind_of, ratio_of_one
 from .method import Method, Task, first_of_task, solve_stages
+from .trials import unseen_kinds
 from .uncertain import Determined, Uncertain, determine, placed, told
 
 

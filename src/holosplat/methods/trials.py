@@ -1,24 +1,31 @@
-"""Hypotheses about light and noise, each carried as far as a volume in every fold of the coarse frames."""
+"""Decisions by unseen frames: hypotheses about light and noise, each carried as far as a volume in every fold of the
+coarse frames; on which side of its medium's the δ of matter lies (bodies in air or in a lighter medium, or holes in a
+denser one); and whether Gaussians or the surfaces cut out of them predict better. Training frames prefer the freer of
+these two kinds, which also explains by half a density what is in the wrong place."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property, partial
 
 import torch
 from torch import Tensor
 from torch.nn.functional import interpolate, pad
 
-from ..checks import InputError, require
-from ..inference import MARGIN, Score
+from ..baselines import HolographicTV
+from ..checks import InputError, NoMatterError, require
+from ..inference import MARGIN, Decision, Score, select
+from ..matter import MaterialPrior
 from ..optics.background import FLUX, ORDER, Background, Light, LightOptions
 from ..optics.noise import NoiseModel
 from ..optics.patterns import fixed_pattern, smooth_modes
-from ..representations import VoxelGrid
+from ..representations import Stored, VoxelGrid
 from ..scan import Scan
-from .cross_validation import FirstVolumes, coarse_binning, lit_by_halves, predictions
-from .method import Task
+from .cross_validation import EFFORT, FirstVolumes, Folds, coarse_binning, lit_by_halves, predicted_frames, predictions
+from .keeper import NAME, Unseen
+from .method import Method, Task, run_stages, unheard
 
 NULL = "as measured"
 UNEVEN = "uneven light"
@@ -236,3 +243,135 @@ def _spread(images: Tensor, shape: tuple[int, int], factor: int, how: str) -> Te
         ((n % factor) // 2, n - few - (n % factor) // 2) for n, few in zip(shape, wide.shape[-2:])
     )
     return pad(wide, (left, right, top, bottom), mode="replicate")
+
+
+KIND = "kinds of results"
+
+
+def unseen_kinds(task: Task, method: Method) -> Unseen | None:
+    """What decides between kinds of results of a run; None where there is one kind, or where poses are free, for those
+    of unseen views are not known."""
+    return partial(decide_kind, task, method) if method.mixes_kinds and task.freedom is None else None
+
+
+def decide_kind(task: Task, method: Method, null: str, other: str) -> Decision:
+    """Which kind of result predicts unseen views, where `method` makes both on its way; null: the kind of its last one.
+
+    The method runs on coarse frames of the other views, with a part `EFFORT` of its steps. A kind that it does not make
+    there predicts what its last state does. Two views are compared by data fission.
+    """
+    folds = Folds.of(task.scan)
+
+    @cache
+    def scores(fold: int) -> dict[str, Score]:
+        seen, unseen = folds.split(fold)
+        lit = task.lit and task.lit.part(torch.from_numpy(folds.kept(fold)), folds.binning)
+        last = dict[str, tuple[Stored, int]]()
+
+        def look(name: str, found: Stored, oversample: int, fitted: bool, train: Scan) -> None:
+            last[found.kind] = found, oversample
+
+        part = replace(task, scan=seen, lit=lit, first=None, near=False, on_start=unheard)
+        with suppress(NoMatterError):  # what is made before it stands
+            run_stages(method.with_effort(EFFORT), part, look)
+        expected = {kind: predicted_frames(unseen.exposures, *state) for kind, state in last.items()}
+        expected = expected or {null: torch.ones(unseen.frames.shape)}
+        return {kind: Score.of(unseen.left(frames.double())) for kind, frames in expected.items()}
+
+    def score(kind: str, fold: int) -> Score:
+        found = scores(fold)
+        return found.get(kind) or list(found.values())[-1]
+
+    task.on_progress(KIND, 0.0)
+    return select(NAME, (null, other), score, folds.count, by=folds.by)
+
+
+SIGN = "sign of the contrast"
+ABOVE, BELOW = "δ above the medium's", "δ below the medium's"
+BOTH = "δ on both sides of the medium's"
+
+
+Scoring = Callable[[FirstVolumes, int, str], Score]
+"""Of first volumes, on the unseen frames of a fold; `WITHOUT` their matter, or with it ("")."""
+
+
+def decide_sign(first: FirstVolumes, *scores: Scoring) -> tuple[FirstVolumes, tuple[Decision, ...]]:
+    """The first volumes of the sign that unseen frames speak for, and the decision; none where the sign is known.
+
+    scores: in even light, and then in such light as may have hidden the sign: each is asked where those before it have
+    left the sign open. A sign under which no matter is found predicts even light, and a sign is sure only where its
+    matter predicts frames better than none.
+    """
+    if first.prior.sign or first.prior.two_sided:
+        return first, ()
+    first.on_progress(SIGN, 0.0)
+    holes = FirstVolumes(first.folds, first.prior.signed(-1), first.on_progress, first.options)
+    volumes = {ABOVE: first, BELOW: holes}
+
+    def asked(score: Scoring, null: str, other: str) -> Decision:
+        def scored(name: str, fold: int) -> Score:
+            sign, without, _ = name.partition(WITHOUT)
+            try:
+                return score(volumes[sign], fold, without)
+            except InputError:  # there is no such matter, or no such light
+                return _without_matter(first, fold)
+
+        beside = {other: (other + WITHOUT,)}
+        return select(SIGN, (null, other), scored, first.folds.count, by=first.folds.by, beside=beside)
+
+    for score in scores:
+        decision = asked(score, ABOVE, BELOW)
+        if decision.choice == BELOW or asked(score, BELOW, ABOVE).choice == ABOVE:
+            break
+    return volumes[decision.choice], (decision,)
+
+
+def decide_sides(first: FirstVolumes, light: LightOptions, told: Hypothesis = ()) -> tuple[FirstVolumes, Decision]:
+    """The first volumes of matter on one side of its medium, or on both, and the decision between them.
+
+    Light makes up for matter that may not be there, and both sides for light. So both sides must predict unseen frames
+    better than one, under the light that is `told` alone, and no worse than one in the light that was taken beside it:
+    where these are alike, the frames are left alone.
+    """
+    first.on_progress(SIGN, 0.0)
+    one = ABOVE if first.prior.delta_sign > 0 else BELOW
+    two = both_sides(first)
+    lit, single = f"{one} in {name_of(first.taken)}", Trials(first, light)
+    trials = {one: (single, told), BOTH: (Trials(two, light), told)}
+    if first.taken != told:
+        trials[lit] = single, first.taken
+
+    def scored(name: str, fold: int) -> Score:
+        side, without, _ = name.partition(WITHOUT)
+        tried, taken = trials[side]
+        try:
+            return tried.score(name_of(taken) + without, fold)
+        except InputError:  # there is no such matter
+            return _without_matter(first, fold)
+
+    beside, by = {BOTH: (BOTH + WITHOUT,)}, first.folds.by
+    decision = select(SIGN, tuple(trials), scored, first.folds.count, by=by, beside=beside)
+    if decision.choice == BOTH:
+        return two, decision
+    return first, replace(decision, choice=one)
+
+
+def both_sides(first: FirstVolumes) -> FirstVolumes:
+    """The same of matter on both sides of its medium, with the usual steps, for no bound makes them end sooner."""
+    usual = HolographicTV()
+    how = replace(first.options, retrieval=usual.retrieval, iterations=usual.iterations)
+    return FirstVolumes(first.folds, first.prior.on_both_sides(), first.on_progress, how)
+
+
+def _without_matter(first: FirstVolumes, fold: int) -> Score:
+    unseen = first.folds.split(fold)[1]
+    return Score.of(unseen.left(torch.ones(unseen.frames.shape, dtype=torch.float64)))
+
+
+def with_sign(prior: MaterialPrior, decisions: Sequence[Decision]) -> MaterialPrior:
+    """`prior` with the sign, or both, that was decided for last, if any was."""
+    for each in decisions:
+        if each.name == SIGN:
+            both = each.choice == BOTH
+            prior = prior.on_both_sides() if both else prior.signed(-1 if each.choice == BELOW else 1)
+    return prior

@@ -1,12 +1,12 @@
 from .air import find_air as find_air
 from .camera import Camera as Camera
+from .camera import Illumination as Illumination
 from .coherence import Spectrum as Spectrum
 from .coherence import effective_geometry as effective_geometry
 from .coherence import source_blur as source_blur
 from .detector import bin_pixels as bin_pixels
 from .detector import blur as blur
 from .detector import poisson as poisson
-from .illumination import Illumination as Illumination
 from .noise import NoiseModel as NoiseModel
 from .propagation import exit_wave as exit_wave
 from .propagation import exit_wave_minus_one as exit_wave_minus_one

@@ -23,7 +23,7 @@ from ..methods import Method, Task
 from ..methods.continued import Continued
 from ..methods.illumination import prepared
 from ..methods.keeper import NAME, Keeper
-from ..methods.kinds import decide_kind
+from ..methods.trials import decide_kind
 from ..progress import FitProgress, FitState
 from ..representations import Stored, SurfaceMesh
 from ..scan import Scan

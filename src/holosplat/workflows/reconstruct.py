@@ -20,8 +20,8 @@ from ..methods import Auto, Gaussians, Method, Settled, Task, finished, learned,
 from ..methods.cross_validation import first_picture
 from ..methods.illumination import prepared
 from ..methods.keeper import Keeper
-from ..methods.kinds import unseen_kinds
 from ..methods.method import Ended, Look, run_stages
+from ..methods.trials import unseen_kinds
 from ..methods.uncertain import Determined, Uncertain
 from ..optics.background import LightOptions
 from ..optics.sampling import fringe_sampling

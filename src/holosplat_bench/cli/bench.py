@@ -14,8 +14,7 @@ from tyro.conf import Positional, arg, subcommand
 from holosplat.checks import require
 from holosplat.cli.places import Kept, with_checked_arguments
 from holosplat.cli.progress import ProgressBar
-from holosplat.cli.room import tell
-from holosplat.cli.sentence import INTERRUPTED
+from holosplat.cli.sentence import INTERRUPTED, tell
 from holosplat.ranges import Seed
 
 if TYPE_CHECKING:
@@ -117,9 +116,8 @@ def run(
 
     from ..suite.case import case_names, load_case
     from ..suite.folder import BenchFolder
-    from ..suite.methods import ALIGNED, METHODS
+    from ..suite.methods import ALIGNED, METHODS, REFERENCES
     from ..suite.prepare import MEASURED, MeasuredCase
-    from ..suite.references import REFERENCES
     from ..suite.run import Suite, chosen, run_suite
 
     if list_only:

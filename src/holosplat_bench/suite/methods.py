@@ -16,8 +16,10 @@ from holosplat.align.derivatives import blurred, in_pixels, projections
 from holosplat.align.find import align_views
 from holosplat.align.initial_geometry import shifts_by_mass
 from holosplat.baselines import TOMOGRAPHIES
+from holosplat.beamline.declared.declaration import Case
+from holosplat.checks import require
 from holosplat.geometry import Grid, Views
-from holosplat.matter import Known, MaterialPrior
+from holosplat.matter import Known, MaterialPrior, Matter
 from holosplat.methods import (
     Auto,
     Gaussians,
@@ -39,11 +41,13 @@ from holosplat.optics.retrieval import tikhonov
 from holosplat.planning.acts import of_simulation
 from holosplat.planning.needs import Costs, Needs, Sizes, of_fit
 from holosplat.progress import Progress
+from holosplat.representations.voxels import VoxelGrid
 from holosplat.scan import Exposures, Scan
-from holosplat.volume import Object
+from holosplat.volume import Object, Volume
 from holosplat.workflows.reconstruct import reconstruct
 
 from ..opponents.photographs import AlphaSplats, RadianceFields
+from .prepare import MeasuredCase
 
 Aligner = Callable[[Scan, MaterialPrior, Progress], Scan]
 """The training frames in other exposures."""
@@ -298,3 +302,47 @@ def of_methods(exposures: Exposures, is_test: np.ndarray, samples: int, methods:
 def of_benchmark(cases: Sequence[Needs]) -> Needs:
     """What several cases take, one after the other."""
     return Needs(max(one.memory for one in cases), sum(one.disk for one in cases), sum(one.seconds for one in cases))
+
+
+@dataclass(frozen=True)
+class Reference:
+    """name: for the table; summary: one line of what it is; run: (case, true volume, on_progress) → Object,
+    `InputError` with the reason where the case has no such reference."""
+
+    name: str
+    summary: str
+    run: Callable[[Case | MeasuredCase, Volume, Progress], Object]
+
+
+def truth_on_voxels(case: Case | MeasuredCase, truth: Volume, on_progress: Progress) -> VoxelGrid:
+    """The true volume itself: what voxels of one pixel can hold, at their best."""
+    on_progress("truth on voxels", 0.0)
+    scales = [float(np.abs(values).max()) for values in (truth.delta, truth.beta)]
+    channels = [values / (scale or 1.0) for values, scale in zip((truth.delta, truth.beta), scales)]
+    return VoxelGrid(torch.from_numpy(np.stack(channels)), truth.grid, Matter.free(*scales))
+
+
+def tv_of_true_lines(case: Case | MeasuredCase, truth: Volume, on_progress: Progress) -> VoxelGrid:
+    """Total-variation tomography from the true thickness in the training views: phase retrieval without error."""
+    require(
+        isinstance(case, Case) and case.prior.fixes_level,
+        "the true thickness needs a known material, but methods are told of none here.",
+    )
+    assert isinstance(case, Case)
+    views = case.true_exposures().views[np.flatnonzero(~case.is_test)]
+    material = case.prior.materials[0]
+    _, projected_delta = case.scene.project(views)
+    lines = (projected_delta / material.delta).float()
+    grid = Grid.of_views(views)
+    values = TOMOGRAPHIES["tv"](lines, views, grid, 1.0, lambda fraction: on_progress("tomography", fraction))
+    return VoxelGrid(values[None], grid, Matter.one(*material))
+
+
+REFERENCES = {
+    reference.name: reference
+    for reference in (
+        Reference("truth-on-voxels", "the true volume on voxels of one pixel", truth_on_voxels),
+        Reference("tv-true-lines", "TV tomography from the true thickness of the training views", tv_of_true_lines),
+    )
+}
+"""Name → reference."""

@@ -33,10 +33,9 @@ from holosplat.workflows.evaluate import Scores, score_object
 from holosplat.workflows.provenance import environment, scan_hash
 
 from .folder import REFERENCE, BenchFolder, Row, good_name
-from .methods import Aligner, BenchMethod
+from .methods import Aligner, BenchMethod, Reference
 from .pictures import TRUTH, Arrays, method_picture, truth_picture
 from .prepare import MeasuredCase, agreement, prepared
-from .references import Reference
 
 BLURS = (3.0, 1.0)
 """Gaussian blurs of both volumes [voxels], one after the other: a wide one catches moves of some voxels."""

@@ -7,9 +7,8 @@ from collections.abc import Callable
 from ...model import Model
 from ...scan import Scan
 from ..problem import Term
-from .frames import FrameTerm, alignment_prior, light_prior
+from .frames import FrameTerm, Objective, alignment_prior, light_prior
 from .object import Anisotropy, VolumeTerm
-from .objective import Objective
 
 Build = Callable[[float, Model, Scan], Term]
 """(weight, the model at the start, the training frames) → the term."""

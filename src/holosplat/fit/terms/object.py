@@ -18,7 +18,7 @@ from ...representations import GaussianCloud
 from ..problem import FIXED, Batch, LossPart
 from ..total_variation import total_variation
 from . import comparisons
-from .objective import Objective
+from .frames import Objective
 
 DEPTH, VIEWS = 100.0, 8.0
 """Voxels along the beam, and views, for which the weights of the terms on the volume are meant. Few views give
