@@ -23,7 +23,6 @@ from ..io.hdf5 import open_hdf5
 from ..io.lock import Writer, sole_writer, writer_of
 from ..io.provenance import sha256
 from ..ranges import require_plausible
-from ..representations import KINDS, MovingSurfaces, Stored, VoxelGrid
 from .provenance import CONFIG_SUM, MANIFEST, RUN, config_sum, faults, require_bound, write_manifest
 
 if TYPE_CHECKING:
@@ -377,6 +376,8 @@ def read_status(folder: RunFolder) -> RunStatus:
 
 def _object_of(state: Mapping[str, Any]) -> Stored | None:
     """The object of a checkpoint as its fit has made it; None where none is kept."""
+    from ..representations import KINDS, MovingSurfaces, VoxelGrid  # which load torch
+
     fit = state.get("fit") or {}
     if "volume" in fit:
         return VoxelGrid.from_state(fit["volume"])
