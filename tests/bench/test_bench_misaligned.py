@@ -56,8 +56,8 @@ def test_frames_are_taken_elsewhere_than_methods_are_told(case, scan):
     np.testing.assert_array_equal(scan.frames, replace(case, exposures=true, misalignment=Misalignment()).scan().frames)
     planned = replace(case, misalignment=Misalignment())
     assert fingerprint(planned) != fingerprint(case)
-    assert described(case)["misalignment"]["shift_px"] == 1.0
-    assert "misalignment" not in described(planned)
+    assert described(case, case.exposures, case.is_test)["misalignment"]["shift_px"] == 1.0
+    assert "misalignment" not in described(planned, planned.exposures, planned.is_test)
 
 
 def test_a_rigid_move_is_found_to_a_hundredth_of_a_voxel():

@@ -14,7 +14,7 @@ from tyro.conf import Positional, arg, subcommand
 from holosplat.checks import require
 from holosplat.cli.places import Kept, with_checked_arguments
 from holosplat.cli.progress import ProgressBar
-from holosplat.cli.sentence import INTERRUPTED, tell
+from holosplat.cli.sentence import INTERRUPTED, interruptible, say, tell
 from holosplat.ranges import Seed
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def thesis(
     if not interrupted or any(folder.finished(configuration.name) for configuration in chosen):
         _report_study(folder)
     if interrupted:
-        _say(f"interrupted; what is done stays in {out}, and the same command goes on from there")
+        say(f"interrupted; what is done stays in {out}, and the same command goes on from there")
         raise SystemExit(INTERRUPTED)
 
 
@@ -74,7 +74,7 @@ def _report_study(folder: StudyFolder) -> None:
     from ..thesis.pages.page import write_study
 
     for path in write_study(load_study(folder), folder.path):
-        _say(f"wrote {path}")
+        say(f"wrote {path}")
 
 
 FIRST_SEED = 101
@@ -142,13 +142,9 @@ def run(
     folder = BenchFolder(out)
     folder.require_usable()
     _tell({name: source for name, source in sources.items() if name not in MEASURED}, suite, folders, out)
-    try:
-        with sole_writer(out), _Screen() as screen:
-            run_suite(suite, folder, retry=retry, on_progress=screen.show, on_row=screen.tell)
-    except KeyboardInterrupt:
-        _say(f"interrupted; what {out} holds is whole, and the same command goes on from there")
-        raise SystemExit(INTERRUPTED) from None
-    _say(f"{out} holds all {len(suite)} rows; now: holosplat bench report {out}")
+    with interruptible(lambda: _kept(out)), sole_writer(out), _Screen() as screen:
+        run_suite(suite, folder, retry=retry, on_progress=screen.show, on_row=screen.tell)
+    say(f"{out} holds all {len(suite)} rows; now: holosplat bench report {out}")
 
 
 def report(folder: Positional[Path] = Path("bench")) -> None:
@@ -161,7 +157,7 @@ def report(folder: Positional[Path] = Path("bench")) -> None:
     from ..suite.pages.report import write_bench_report
 
     for path in write_bench_report(BenchFolder(folder)):
-        _say(f"wrote {path}")
+        say(f"wrote {path}")
 
 
 @dataclass(frozen=True)
@@ -214,13 +210,9 @@ def arena(
     folder = ArenaFolder(out)
     folder.require_usable()
     if made.absent:
-        _say(f"not installed, and so left out: {', '.join(made.absent)}; pip install 'holosplat[bench]' has them")
-    try:
-        with sole_writer(out), _Screen() as screen:
-            run_arena(made, folder, retry=retry, on_progress=screen.show, on_row=screen.tell_arena)
-    except KeyboardInterrupt:
-        _say(f"interrupted; what {out} holds is whole, and the same command goes on from there")
-        raise SystemExit(INTERRUPTED) from None
+        say(f"not installed, and so left out: {', '.join(made.absent)}; pip install 'holosplat[bench]' has them")
+    with interruptible(lambda: _kept(out)), sole_writer(out), _Screen() as screen:
+        run_arena(made, folder, retry=retry, on_progress=screen.show, on_row=screen.tell_arena)
     from ..suite.arena.history import read_history
     from ..suite.pages.arena import write_arena
 
@@ -229,7 +221,7 @@ def arena(
     if history is not None:
         entry.write(history / entry.file)
     for path in write_arena(entry, [] if history is None else read_history(history), folder.path):
-        _say(f"wrote {path}")
+        say(f"wrote {path}")
 
 
 def bench(
@@ -266,14 +258,14 @@ class _Screen:
     def tell(self, row: Row, left: int) -> None:
         """A row is written."""
         self._clear()
-        _say(f"{row.case} {row.seed} {row.method}: {_outcome(row)} ({left} to go)")
+        say(f"{row.case} {row.seed} {row.method}: {_outcome(row)} ({left} to go)")
 
     def tell_arena(self, row: Row, left: int) -> None:
         """A row of the arena is written."""
         self._clear()
         numbers = ", ".join(f"{name} {value:.3g}" for name, value in row.test.items() if value is not None)
         said = f"{numbers}, {row.seconds:.3g} s" if row.done else f"no result: {row.reason}"
-        _say(f"{row.case} {row.method}: {said} ({left} to go)")
+        say(f"{row.case} {row.method}: {said} ({left} to go)")
 
     def _clear(self) -> None:
         if self._bar is not None:
@@ -296,7 +288,7 @@ def _at_hand(sources: dict[str, str], data: Path | None) -> dict[str, str]:
 
     missing = missing_data(tuple(name for name in sources if name in MEASURED), data)
     for name, why in missing.items():
-        _say(f"{name} is skipped, for its data are not at hand (--data FOLDER): {why}")
+        say(f"{name} is skipped, for its data are not at hand (--data FOLDER): {why}")
     return {name: source for name, source in sources.items() if name not in missing}
 
 
@@ -326,5 +318,5 @@ def _list(cases: list[str], methods: Mapping[str, BenchMethod]) -> None:
         print(f"  {name:24} {method.family}: {method.summary}")
 
 
-def _say(text: str) -> None:
-    print(text, file=sys.stderr)
+def _kept(out: Path) -> str:
+    return f"interrupted; what {out} holds is whole, and the same command goes on from there"

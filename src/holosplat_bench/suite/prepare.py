@@ -15,6 +15,8 @@ import torch
 
 from holosplat.baselines.algebraic import filtered_backprojection
 from holosplat.beamline.declared.declaration import Case
+from holosplat.beamline.light import EVEN_LIGHT, UnevenLight
+from holosplat.beamline.misalignment import AS_PLANNED, Misalignment
 from holosplat.checks import InputError, require
 from holosplat.geometry import Grid
 from holosplat.io.atomic import read_json, write_json
@@ -23,7 +25,7 @@ from holosplat.io.reading import Part, Reading, Told
 from holosplat.io.samples import fetched, sample
 from holosplat.io.volumes import read_volume, write_volume
 from holosplat.matter import KnownRatio
-from holosplat.scan import Scan
+from holosplat.scan import Exposures, Scan
 from holosplat.specimens.continuous import ContinuousScene
 from holosplat.specimens.drawn import ChangingScene, Scene, Still
 from holosplat.specimens.rods import RodScene
@@ -60,6 +62,9 @@ class MeasuredCase:
     folder: Path | None = None
     seed: int = 0
     balls: tuple[()] = ()
+    photons: None = None
+    light: UnevenLight = EVEN_LIGHT
+    misalignment: Misalignment = AS_PLANNED
 
     def scan(self) -> Scan:
         """The corrected frames, those for training marked; `InputError` where the data are not at hand."""
@@ -81,27 +86,12 @@ class MeasuredCase:
         said = (self.reading.as_table(), self.correction, self.every, self.count, self.prior.as_dict(), self.seed)
         return hashlib.sha256(repr((sample(self.sample).sha256, said)).encode()).hexdigest()[:16]
 
-    def described(self, scan: Scan) -> dict[str, Any]:
-        """The case in numbers, for the report."""
-        exposures, known = scan.exposures, sample(self.sample)
-        return {
-            "case": self.name,
-            "seed": self.seed,
-            "summary": self.summary,
-            "specimen": f"{known.title} ({known.source}; {known.licence}), measured; the truth is filtered "
-            "back-projection of all views",
-            "detector": list(scan.views.shape),
-            "pixel_size_m": scan.views.pixel_size,
-            "energy_kev": exposures.one_energy("a measured case"),
-            "distance_m": [float(exposures.distance.min()), float(exposures.distance.max())],
-            "psf_sigma_px": [0.0, 0.0],
-            "training_frames": int((~scan.is_test).sum()),
-            "held_out_frames": int(scan.is_test.sum()),
-            "shares_axis": scan.views.shares_axis,
-            "photons": None,
-            "light": {},
-            "prior": self.prior.as_dict(),
-        }
+    @property
+    def specimen(self) -> str:
+        """What the data show, and where they come from."""
+        known = sample(self.sample)
+        words = f"{known.title} ({known.source}; {known.licence}), measured"
+        return f"{words}; the truth is filtered back-projection of all views"
 
 
 def back_projected(scan: Scan, prior: KnownRatio) -> Volume:
@@ -182,8 +172,9 @@ def prepared(case: Case | MeasuredCase, folder: Path) -> tuple[Scan, Volume]:
         write_volume(truth_file, case.truth())
     scan, truth = read_scan(scan_file), read_volume(truth_file)
     if not record.is_file():  # last, so that a folder with it is complete
-        facts = case.described(scan) if isinstance(case, MeasuredCase) else described(case)
-        write_json(record, {**facts, "fingerprint": mark, "scan_hash": scan_hash(scan)})
+        write_json(
+            record, {**described(case, scan.exposures, scan.is_test), "fingerprint": mark, "scan_hash": scan_hash(scan)}
+        )
     whole = read_json(record).get("scan_hash") == scan_hash(scan)
     require(whole, f"{scan_file} is not the scan that was simulated, its frames were changed; choose another --out.")
     return scan, truth
@@ -234,9 +225,9 @@ def _arrays(case: Case) -> Iterable[np.ndarray]:
     yield from (exposures.distance, exposures.psf_sigma_px, exposures.time, np.asarray(case.is_test, dtype=bool))
 
 
-def described(case: Case) -> dict[str, Any]:
+def described(case: Case | MeasuredCase, exposures: Exposures, is_test: np.ndarray) -> dict[str, Any]:
     """A case in numbers, for the report: how it is measured, and what methods are told."""
-    exposures, views = case.exposures, case.exposures.views
+    views = exposures.views
     return {
         "case": case.name,
         "seed": case.seed,
@@ -247,8 +238,8 @@ def described(case: Case) -> dict[str, Any]:
         "energy_kev": exposures.one_energy("a case of the benchmark"),
         "distance_m": [float(exposures.distance.min()), float(exposures.distance.max())],
         "psf_sigma_px": [float(exposures.psf_sigma_px.min()), float(exposures.psf_sigma_px.max())],
-        "training_frames": int(np.count_nonzero(~np.asarray(case.is_test))),
-        "held_out_frames": int(np.count_nonzero(case.is_test)),
+        "training_frames": int(np.count_nonzero(~is_test)),
+        "held_out_frames": int(np.count_nonzero(is_test)),
         "shares_axis": views.shares_axis,
         "photons": case.photons,
         "light": case.light.facts(),

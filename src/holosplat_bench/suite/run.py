@@ -32,6 +32,7 @@ from holosplat.volume import Object, Volume
 from holosplat.workflows.evaluate import Scores, score_object
 from holosplat.workflows.provenance import environment, scan_hash
 
+from .arena.contest import status_bytes
 from .folder import REFERENCE, BenchFolder, Row, good_name
 from .methods import Aligner, BenchMethod, Reference
 from .pictures import TRUTH, Arrays, method_picture, truth_picture
@@ -132,7 +133,7 @@ def _contrast(volume: Volume, ball: Ball) -> float:
     return float(values[inside].mean() - values[around].mean())
 
 
-STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+CLEAR = Path("/proc/self/clear_refs")
 RESET_PEAK = "5"
 """What Linux takes to forget the peak of a process's memory (proc(5), clear_refs)."""
 
@@ -143,22 +144,13 @@ def memory_growth() -> Iterator[Callable[[], int | None]]:
     before = None
     with suppress(OSError):
         CLEAR.write_text(RESET_PEAK)
-        before = _status("VmRSS")
+        before = status_bytes("VmRSS")
 
     def growth() -> int | None:
-        peak = _status("VmHWM")
+        peak = status_bytes("VmHWM")
         return None if before is None or peak is None else max(0, peak - before)
 
     yield growth
-
-
-def _status(key: str) -> int | None:
-    """An entry of /proc/self/status [bytes]."""
-    try:
-        lines = STATUS.read_text(encoding="ascii", errors="replace").splitlines()
-        return 1024 * next(int(line.split()[1]) for line in lines if line.startswith(key + ":"))
-    except (OSError, StopIteration):
-        return None
 
 
 TRUTH_THRESHOLD = 0.5

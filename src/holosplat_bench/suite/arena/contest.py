@@ -121,8 +121,8 @@ ALONE = {
     "QT_QPA_PLATFORM": "offscreen",
 }
 """One thread, the processor alone, and no windows, for all contestants."""
-MEMORY_UNIT = 1024
-"""`ru_maxrss` counts kilobytes on Linux (getrusage(2))."""
+STATUS, MEMORY_UNIT = Path("/proc/self/status"), 1024
+"""It and `ru_maxrss` count kilobytes on Linux (getrusage(2), proc(5))."""
 SPENT, PEAK = "processor_seconds", "peak_bytes"
 """Entries of an answer's file beside the answer."""
 
@@ -188,13 +188,18 @@ def processor_seconds() -> float:
     return sum(one.ru_utime + one.ru_stime for one in used)
 
 
+def status_bytes(key: str) -> int | None:
+    """An entry of /proc/self/status [bytes]; None where there is none."""
+    try:
+        lines = STATUS.read_text(encoding="ascii", errors="replace").splitlines()
+        return MEMORY_UNIT * next(int(line.split()[1]) for line in lines if line.startswith(key + ":"))
+    except (OSError, StopIteration):
+        return None
+
+
 def _peak() -> int:
     """Peak memory of this process [bytes]; VmHWM where there is one, for ru_maxrss has the parent's in it."""
-    status = Path("/proc/self/status")
-    if status.is_file():
-        lines = status.read_text(encoding="ascii", errors="replace").splitlines()
-        return MEMORY_UNIT * next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:"))
-    return MEMORY_UNIT * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return status_bytes("VmHWM") or MEMORY_UNIT * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 def main(act: str, asked: str, answered: str, calls: str) -> None:

@@ -17,6 +17,7 @@ from holosplat.matter import Matter
 from holosplat.metrics.volumes import robust_material_delta
 from holosplat.optics.retrieval import RETRIEVALS
 from holosplat.optics.sampling import fringe_sampling
+from holosplat.progress import Progress
 from holosplat.representations import VoxelGrid
 from holosplat.units import wavelength, wavenumber
 from holosplat.version import source_commit
@@ -28,9 +29,6 @@ from .cases import SealedCase, prepare_case
 from .contest import TRACKS, WARM, Answer, Contestant, Outcome, Question, Track, compete
 from .entrants import BEST_PAIR, CONTESTANTS
 from .history import Entry
-
-Progress = Callable[[str, float], None]
-"""A stage, and how much of it is done."""
 
 
 class ArenaFolder(BenchFolder):
