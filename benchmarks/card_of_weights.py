@@ -13,7 +13,7 @@ from pathlib import Path
 
 from rows import read
 
-from holosplat.learning.weights import SHIPPED, Card, read_weights, write_weights
+from holosplat.learning.start import SHIPPED, Card, read_weights, write_weights
 from holosplat.tables import from_table, to_table
 from holosplat.training.options import Ranges
 from holosplat.training.train import limits

@@ -23,7 +23,7 @@ from rows import written
 
 from holosplat import Exposures, MeshScene, Views, simulate
 from holosplat.materials import HAEMOGLOBIN
-from holosplat.optics.detector import bin_pixels, poisson
+from holosplat.optics.propagation import bin_pixels, poisson
 from holosplat.optics.retrieval import contrast_transfer, tikhonov
 from holosplat.specimens import random_cells
 from holosplat.units import wavelength, wavenumber

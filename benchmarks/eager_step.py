@@ -15,8 +15,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d, pad, softplus
 
 import holosplat as hs
-from holosplat.optics.detector import gaussian_transfer
-from holosplat.optics.propagation import fresnel_transfer
+from holosplat.optics.propagation import fresnel_transfer, gaussian_transfer
 from holosplat.units import wavenumber
 
 CUTOFF = 4.0

@@ -26,8 +26,7 @@ from machine import commit
 from holosplat.io.atomic import atomic_path
 from holosplat.io.vtk import read_meshes
 from holosplat.mesh import TriangleMesh
-from holosplat.specimens.flow.channel import Channel
-from holosplat.specimens.flow.suspension import Medium, State, Stepper, Suspension
+from holosplat.specimens.flow.suspension import Channel, Medium, State, Stepper, Suspension
 from holosplat.specimens.membrane.model import Elasticity, Membrane
 from holosplat.specimens.membrane.rest import elongation, shape_change
 from holosplat.specimens.repair import closed

@@ -19,7 +19,7 @@ from holosplat.checks import InputError
 from holosplat.io.formats import read, read_volume_file
 from holosplat.io.pvd import read_pvd
 from holosplat.io.vtk import read_meshes, write_mesh
-from holosplat.learning.weights import read_weights
+from holosplat.learning.start import read_weights
 from holosplat.mesh import TriangleMesh
 from holosplat.specimens.red_cells import random_cells
 from holosplat.training.folder import Dataset

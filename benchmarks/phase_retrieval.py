@@ -17,7 +17,7 @@ import torch
 
 from holosplat import Exposures, MeshScene, Views, simulate
 from holosplat.materials import HAEMOGLOBIN, PLASMA, RED_CELL
-from holosplat.optics.detector import bin_pixels, poisson
+from holosplat.optics.propagation import bin_pixels, poisson
 from holosplat.optics.retrieval import RETRIEVALS, Linear, paganin
 from holosplat.specimens import random_cells
 

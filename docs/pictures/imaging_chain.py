@@ -26,7 +26,7 @@ from holosplat.io.raw_file import FLAT, PROJECTION
 from holosplat.io.scan_file import open_scan
 from holosplat.optics.camera import Camera, Illumination
 from holosplat.optics.coherence import Spectrum, joined_blur_px, source_blur
-from holosplat.optics.detector import poisson
+from holosplat.optics.propagation import poisson
 from holosplat.report.style import PanelGrid, image_panel, letter, scale_bar, styled
 from holosplat.workflows.correct import CorrectionOptions, correct
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from holosplat.align.derivatives import NUMBERS
-from holosplat.align.null_space import hardly_told
+from holosplat.align.derivatives import NUMBERS, hardly_told
 
 
 def test_the_widest_direction_is_named_in_units_of_the_prior():

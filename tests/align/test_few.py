@@ -11,9 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from helpers.misaligned_balls import MATERIAL, scan_of
 from holosplat.align import PoseOptions, PosePrior, align_views
-from holosplat.align.derivatives import projections
+from holosplat.align.derivatives import beside, motions, projections
 from holosplat.align.marginal_likelihood import SHARP, SOFT, Following, of_poses, weighed
-from holosplat.align.null_space import beside, motions
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.geometry import Grid, Views
 from holosplat.matter import MaterialPrior

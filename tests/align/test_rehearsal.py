@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from helpers.misaligned_balls import MATERIAL, SHAPE, scan_of
+from holosplat.align.derivatives import beside, motions
 from holosplat.align.fixed_matter import Beside
 from holosplat.align.marginal_likelihood import _larger
-from holosplat.align.null_space import beside, motions
 from holosplat.align.poses import PoseOptions, PosePrior, PoseSearch
 from holosplat.align.views import Searched, rehearsed, with_random_phases
 from holosplat.beamline.misalignment import Misalignment

@@ -8,10 +8,9 @@ import pytest
 from helpers.misaligned_balls import SHAPE
 from helpers.moving_balls import beams, thickness
 from helpers.row_images import gaussians, placed
-from holosplat.align.derivatives import in_pixels
+from holosplat.align.derivatives import FACTOR as NUMBERS
+from holosplat.align.derivatives import RowInformation, in_pixels
 from holosplat.align.initial_geometry import ANGLE, Images, geometry_from_rows
-from holosplat.align.null_space import FACTOR as NUMBERS
-from holosplat.align.null_space import RowInformation
 from holosplat.align.row_sums import COUNT, FACTOR, RETRIEVED, RowPrior, by_rows, plane_angles
 from holosplat.geometry import Views
 

@@ -11,9 +11,8 @@ from scipy.spatial.transform import Rotation
 from helpers.misaligned_balls import SHAPE
 from helpers.moving_balls import beams, thickness
 from helpers.row_images import gaussians, placed
-from holosplat.align.derivatives import in_pixels, moved_onto
+from holosplat.align.derivatives import RowInformation, in_pixels, motions, moved_onto
 from holosplat.align.initial_geometry import NONE, REVERSED, Images, geometry_from_rows
-from holosplat.align.null_space import RowInformation, motions
 from holosplat.align.row_sums import COUNT, RowPrior, Rows, by_rows, conditions, plane_angles
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.geometry import Views, rotation_tilted

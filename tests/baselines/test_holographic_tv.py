@@ -25,7 +25,7 @@ from holosplat.methods.illumination import prepared
 from holosplat.metrics import dice
 from holosplat.model import measure
 from holosplat.optics.background import LightOptions
-from holosplat.optics.detector import poisson
+from holosplat.optics.propagation import poisson
 from holosplat.projectors.voxels import LatticeProjector, SliceProjector, projector_for, voxel_line_integrals
 from holosplat.projectors.voxels.lattice import lattice_reference
 from holosplat.scan import Scan

@@ -11,7 +11,7 @@ import pytest
 import holosplat as hs
 from helpers.cli import holosplat
 from holosplat.projectors.voxels import SliceProjector
-from holosplat_bench.suite.arena import entrants
+from holosplat_bench.suite.arena import contest
 from holosplat_bench.suite.arena import run as arena_run
 from holosplat_bench.suite.arena.cases import FAMILIES, SealedCase, prepare_case
 from holosplat_bench.suite.arena.contest import Contestant, Question, compete
@@ -177,7 +177,7 @@ def test_the_best_pair_is_of_the_best_rows_and_needs_them(case, tmp_path):
         peer("best-pair", "right", "jobs"),
     )
     arena, judge = Arena([case.name], ["jobs"], SEED, SIDE, 20.0, table), arena_run._Judge.of(case)
-    assert entrants.BEST_PAIR == "best-pair"
+    assert contest.BEST_PAIR == "best-pair"
     assert "run these tracks" in judge.row(table[3], arena, folder).reason
     for contestant, error in zip(table, (0.5, 0.2, 0.3)):
         row = replace(judge.blank, method=arena_run.row_name(contestant), family=contestant.track, status="done")
@@ -259,7 +259,7 @@ def test_the_command_lists_and_refuses(tmp_path):
     assert not (tmp_path / "arena").exists()
 
 
-QUICK = [c for c in entrants.CONTESTANTS if c.distribution in ("", "torch", "astra-toolbox", "svmbir")]
+QUICK = [c for c in contest.CONTESTANTS if c.distribution in ("", "torch", "astra-toolbox", "svmbir")]
 BOUNDS = {"kernels": 0.02, "steps": 1.0, "retrieval": 1.0, "tomography": 1.0}
 """Right orientation, sign and units; a mirrored or negative answer is further away."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from helpers.ball_sample import ball_sample
 from helpers.cli import holosplat, refused, worked
-from holosplat.learning.weights import read_aligned
+from holosplat.learning.start import read_aligned
 from holosplat.representations import AlignedNetwork
 from holosplat.training.folder import Dataset
 from holosplat.training.options import Ranges

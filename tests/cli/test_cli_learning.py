@@ -10,7 +10,7 @@ from helpers.cli import MATTER, holosplat, known, refused, worked
 from holosplat.cli.options import MethodOptions
 from holosplat.io.volumes import read_guess
 from holosplat.learning.network import Guess, Size
-from holosplat.learning.weights import Card, read_weights, write_weights
+from holosplat.learning.start import Card, read_weights, write_weights
 from holosplat.methods import Gaussians
 from holosplat.workflows.run_folder import RunFolder
 

@@ -10,7 +10,7 @@ import torch
 
 from helpers.jets import jet_of
 from holosplat.fit.problem import Batch
-from holosplat.fit.terms.equations import Equations, EquationTerm, SpaceTimeVariation, continuity, divergence, momentum
+from holosplat.fit.terms.field import Equations, EquationTerm, SpaceTimeVariation, continuity, divergence, momentum
 from holosplat.geometry import Grid, Views
 from holosplat.matter import Matter
 from holosplat.model import Instrument, Model

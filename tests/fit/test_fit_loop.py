@@ -22,8 +22,8 @@ from holosplat.geometry import Grid
 from holosplat.matter import Matter
 from holosplat.methods import GaussianRates
 from holosplat.model import Instrument
-from holosplat.optics.detector import poisson
 from holosplat.optics.noise import noise_share
+from holosplat.optics.propagation import poisson
 from holosplat.representations import GaussianCloud, random_cloud
 
 # --- what is fitted, and how fast ---------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from holosplat.checks import InputError
 from holosplat.fit.problem import Batch, Batches, Schedule
-from holosplat.fit.quasi_newton import LONGER, QuasiNewton, direction
+from holosplat.fit.projected_gradient import LONGER, QuasiNewton, direction
 
 SHAPE = (3, 7, 5)
 CURVATURES = torch.from_numpy(np.random.default_rng(0).uniform(1.0, 300.0, SHAPE))

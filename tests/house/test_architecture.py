@@ -94,7 +94,7 @@ def files() -> Files:
 
 
 def _room(path: str) -> str:
-    """`optics/detector.py` → `optics`, `scan.py` → `scan`, a package's own `__init__.py` → empty; rooms of the
+    """`optics/noise.py` → `optics`, `scan.py` → `scan`, a package's own `__init__.py` → empty; rooms of the
     benchmark have its name before theirs."""
     package = f"{BENCH}/" if path.startswith(f"{BENCH}/") else ""
     first = path.removeprefix(package).split("/")[0].removesuffix(".py")

@@ -27,7 +27,7 @@ from holosplat.io.reading import Reading, ends_of, marked, read_angles
 from holosplat.io.stacks import all_images, stack_of
 from holosplat.io.table import Table
 from holosplat.io.vtk import read_meshes
-from holosplat.learning.weights import read_aligned, read_weights
+from holosplat.learning.start import read_aligned, read_weights
 from holosplat.matter import MaterialPrior
 from holosplat.methods import Gaussians
 from holosplat.ranges import COUNT, with_checked_numbers

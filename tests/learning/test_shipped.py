@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from holosplat.learning.weights import SHIPPED, read_weights
+from holosplat.learning.start import SHIPPED, read_weights
 from holosplat.training.options import Ranges, TrainOptions
 from holosplat.training.sample import sample_of
 from holosplat.training.shown import dice, example_of_views

@@ -7,7 +7,7 @@ import torch
 
 from holosplat.checks import InputError
 from holosplat.learning.network import Guess, Size
-from holosplat.learning.weights import Card, read_weights, write_weights
+from holosplat.learning.start import Card, read_weights, write_weights
 
 SMALL = Size((4, 4, 6, 6), 3, (4, 6, 8))
 

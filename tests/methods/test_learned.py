@@ -13,8 +13,7 @@ import holosplat as hs
 from holosplat.baselines import HolographicTV
 from holosplat.inference import Decision
 from holosplat.learning.network import Taps
-from holosplat.learning.start import GuessedMatter, LearnedStart
-from holosplat.learning.weights import Card, Trained
+from holosplat.learning.start import Card, GuessedMatter, LearnedStart, Trained
 from holosplat.methods import Gaussians, Surfaces, Task
 from holosplat.methods.coarse import CoarseToFine
 from holosplat.methods.gaussians import GaussianStage

@@ -12,7 +12,7 @@ import holosplat as hs
 from helpers.unjudged import unjudged
 from holosplat.baselines import HolographicTV
 from holosplat.checks import InputError
-from holosplat.fit.terms.equations import Equations
+from holosplat.fit.terms.field import Equations
 from holosplat.geometry import Views
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.mesh import TriangleMesh

@@ -14,8 +14,7 @@ import holosplat as hs
 from holosplat.geometry import Grid
 from holosplat.inference import Decision, Score
 from holosplat.learning.network import Taps
-from holosplat.learning.start import Guessed, LearnedStart
-from holosplat.learning.weights import Card, Trained
+from holosplat.learning.start import Card, Guessed, LearnedStart, Trained
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.matter import MaterialPrior, Matter
 from holosplat.mesh import TriangleMesh

@@ -11,8 +11,7 @@ from hypothesis.extra.numpy import arrays
 from helpers.strategies import images, numbers
 from holosplat.geometry import Grid
 from holosplat.metrics import dice, fourier_ring_correlation, image_scores, structural_similarity, volume_scores
-from holosplat.metrics.correlation import fourier_shell_correlation, half_bit_threshold, ring_counts
-from holosplat.metrics.images import peak_signal_to_noise
+from holosplat.metrics.images import fourier_shell_correlation, half_bit_threshold, peak_signal_to_noise, ring_counts
 from holosplat.volume import Volume
 
 SHAPES = st.tuples(st.integers(1, 6), st.integers(1, 6), st.integers(1, 6))

@@ -16,8 +16,7 @@ from holosplat.metrics.volumes import normal_distance
 from holosplat.motion.cell_model import CellModel, ChannelFrame
 from holosplat.motion.dynamics import whole_cells
 from holosplat.motion.membrane_fit import CellFlow, Unknowns, advanced
-from holosplat.specimens.flow.channel import Channel
-from holosplat.specimens.flow.suspension import Medium
+from holosplat.specimens.flow.suspension import Channel, Medium
 from holosplat.specimens.membrane.model import Elasticity, Membrane
 from holosplat.specimens.membrane.rest import geodesic_sphere
 from holosplat.specimens.red_cells import RedCell, icosphere

@@ -14,7 +14,7 @@ from helpers.moving_ellipsoids import MATERIAL, scan, true_paths
 from holosplat.checks import InputError
 from holosplat.fit import run as engine
 from holosplat.inference import Decision, Score
-from holosplat.learning.weights import Card, Trained
+from holosplat.learning.start import Card, Trained
 from holosplat.motion import body_tracker, track
 from holosplat.motion.track import NAME, compared_kinds, follow, unexplained
 from holosplat.motion.track_linking import TrackOptions

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from holosplat.beamline.grow import COMPACT, Growth, SeriesFolder, grow, read_compact
 from holosplat.checks import InputError
 from holosplat.io.vtk import read_meshes
-from holosplat.learning.weights import Card
+from holosplat.learning.start import Card
 from holosplat.matter import Matter
 from holosplat.metrics.volumes import normal_distance
 from holosplat.motion.forecast import History, PathForecast, decided, extrapolate

@@ -23,7 +23,7 @@ from holosplat.optics import (
     fresnel_transfer,
     poisson,
 )
-from holosplat.optics.detector import gaussian_transfer
+from holosplat.optics.propagation import gaussian_transfer
 
 
 def transfer(shape: tuple[int, int], lambda_z: float) -> Tensor:

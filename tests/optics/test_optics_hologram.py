@@ -9,9 +9,8 @@ from torch import Tensor
 
 from holosplat import native
 from holosplat.checks import InputError
-from holosplat.optics.detector import gaussian_transfer
 from holosplat.optics.hologram import OpticalPath, hologram, optical_path
-from holosplat.optics.propagation import exit_wave_minus_one, fresnel_propagate, fresnel_transfer
+from holosplat.optics.propagation import exit_wave_minus_one, fresnel_propagate, fresnel_transfer, gaussian_transfer
 from holosplat.units import wavelength, wavenumber
 
 ENERGY, PITCH = 20.0, 0.5e-6

@@ -10,14 +10,15 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from helpers.strategies import images, numbers, vectors
-from holosplat.optics.detector import bin_pixels, gaussian_factors
 from holosplat.optics.hologram import hologram, optical_path
 from holosplat.optics.propagation import (
+    bin_pixels,
     exit_wave,
     exit_wave_minus_one,
     fresnel_factors,
     fresnel_propagate,
     fresnel_transfer,
+    gaussian_factors,
 )
 from holosplat.optics.resampling import Resampling
 from holosplat.optics.sampling import smooth_margin

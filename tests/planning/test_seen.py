@@ -14,7 +14,7 @@ from holosplat.geometry import Views
 from holosplat.matter import Matter
 from holosplat.methods import METHODS, Auto
 from holosplat.model import measure
-from holosplat.optics.detector import poisson
+from holosplat.optics.propagation import poisson
 from holosplat.planning import scan_facts as looking
 from holosplat.planning.needs import UNSEEN, Needs, Seen, Sizes, of_reconstruction
 from holosplat.planning.scan_facts import opposite_likeness, seen_of

@@ -9,16 +9,19 @@ import pytest
 import torch
 
 from holosplat.checks import InputError
-from holosplat.specimens.flow.channel import Channel, Repulsion, contact_forces, wall_forces
 from holosplat.specimens.flow.suspension import (
     BLOB,
     CHUNK,
+    Channel,
     Medium,
+    Repulsion,
     State,
     Stepper,
     Suspension,
+    contact_forces,
     mutual_velocity,
     stokeslet_velocity,
+    wall_forces,
 )
 from holosplat.specimens.membrane.model import Membrane
 from holosplat.specimens.membrane.rest import geodesic_sphere, resting_cell
@@ -128,7 +131,7 @@ def test_pairs_of_cells_in_parts_are_all_of_them(monkeypatch):
     )
     whole = suspension.velocity(nodes)
     monkeypatch.setattr("holosplat.specimens.flow.suspension.pairs_at_a_time", lambda device: 1)
-    monkeypatch.setattr("holosplat.specimens.flow.channel.pairs_at_a_time", lambda device: 1)
+    monkeypatch.setattr("holosplat.specimens.flow.suspension.pairs_at_a_time", lambda device: 1)
     assert torch.allclose(suspension.velocity(nodes), whole, rtol=1e-12, atol=1e-16)
     assert contact_forces(nodes, suspension.channel, suspension.repulsion)[[0, 2]].abs().max() > 0
 

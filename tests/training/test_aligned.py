@@ -13,7 +13,7 @@ from helpers.ball_sample import ball_sample
 from helpers.two_balls import ONE, scan, truth
 from holosplat.checks import InputError
 from holosplat.fit.problem import Schedule
-from holosplat.learning.weights import Card, read_aligned, write_aligned, write_weights
+from holosplat.learning.start import Card, read_aligned, write_aligned, write_weights
 from holosplat.matter import MaterialPrior
 from holosplat.methods import AlignedFit, Onix, PixelNerf, Task, solve
 from holosplat.representations import AlignedNetwork, PixelAligned, PixelAlignedField

@@ -14,7 +14,7 @@ import torch
 from holosplat.checks import InputError
 from holosplat.geometry import rotation_y
 from holosplat.learning.network import Size
-from holosplat.learning.weights import read_weights
+from holosplat.learning.start import read_weights
 from holosplat.training.folder import Dataset
 from holosplat.training.options import LossWeights, Ranges, TrainOptions, ViewSampling
 from holosplat.training.sample import Sample

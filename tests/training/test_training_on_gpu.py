@@ -16,7 +16,7 @@ from helpers.ball_sample import ball_sample
 from helpers.pretended_gpu import OnGpu, pretended_gpu
 from holosplat.checks import InputError
 from holosplat.learning.network import Size
-from holosplat.learning.weights import read_aligned, read_weights
+from holosplat.learning.start import read_aligned, read_weights
 from holosplat.representations import AlignedNetwork
 from holosplat.training.aligned import AlignedTraining, AlignedValidation
 from holosplat.training.folder import Dataset

@@ -26,7 +26,7 @@ from .consistency import (
     half_turn,
     may_be_half,
 )
-from .shadows import EVEN_OR_NOT, shadows
+from .views import EVEN_OR_NOT, shadows
 
 PLACE, BY_ALL, BY_MIRROR = "place of the axis", "consistency of all frames", "frames half a turn apart"
 STEP = 0.25

@@ -23,8 +23,7 @@ from .derivatives import NUMBERS, changes, header, line, moved_onto, unexplained
 from .initial_geometry import shifts_by_mass
 from .phantom import STEPS, Linear, Phantom, find_beads, linearised, placed, solved
 from .poses import DISTANCE, FLUX, SHIFT, TURN, PosePrior
-from .shadows import EVEN_OR_NOT, in_even_light
-from .views import KINDS
+from .views import EVEN_OR_NOT, KINDS, in_even_light
 
 UNTOLD = 0.5
 """Standard error, as a share of what was expected, from which on frames do not tell a number."""

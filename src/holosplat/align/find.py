@@ -22,8 +22,18 @@ from .initial_geometry import SIDES, Images, RowGeometry, geometry_from_rows
 from .poses import DISTANCE, FLUX, SHIFT, TURN, Drift, Level, PoseOptions, PoseSearch
 from .row_sums import plane_angles
 from .series_search import Beams, Moment, SeriesSearch, chosen_moments, whens
-from .shadows import EVEN_OR_NOT, in_even_light
-from .views import DEFAULT, FEW, FEWEST, PLANNED, AlignedViews, Judged, align_still, decided_poses
+from .views import (
+    DEFAULT,
+    EVEN_OR_NOT,
+    FEW,
+    FEWEST,
+    PLANNED,
+    AlignedViews,
+    Judged,
+    align_still,
+    decided_poses,
+    in_even_light,
+)
 
 DRIFT, STAY, LINEAR = "drift of the beams", "none", "linear in time"
 JUDGED = 3

@@ -15,8 +15,7 @@ from ..matter import DeltaBeta
 from ..optics.noise import left_of
 from ..optics.retrieval import Tikhonov, tikhonov
 from ..scan import Scan
-from .derivatives import in_pixels
-from .null_space import RowInformation
+from .derivatives import RowInformation, in_pixels
 from .row_sums import FACTOR, RowEstimate, RowPrior, by_rows, plane_angles
 
 BY = "the same rows"

@@ -19,9 +19,8 @@ from ..optics.sampling import fringe_sampling
 from ..projectors.voxels import LatticeProjector
 from ..representations import SurfaceMesh
 from ..scan import Exposures
-from .derivatives import blurred, in_pixels, predicted, projections
+from .derivatives import beside, blurred, in_pixels, motions, null, predicted, projections
 from .fixed_matter import BLUR
-from .null_space import beside, motions, null
 from .poses import DISTANCE, FLUX, MAGNIFICATION, PoseSearch
 
 DEPTH = 4

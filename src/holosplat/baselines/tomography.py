@@ -13,7 +13,7 @@ from torch import Tensor
 from ..checks import NoMatterError
 from ..geometry import Grid, Views
 from ..memory import memory_kept
-from ..metrics.correlation import shortest_side
+from ..metrics.images import shortest_side
 from ..optics.patterns import smooth_modes
 from ..progress import Advance
 from ..ranges import Metres, Share, Weight, checked_dataclass

@@ -20,8 +20,7 @@ from ..io.vtk import write_mesh
 from ..mesh import TriangleMesh
 from ..progress import Advance
 from ..ranges import Seconds, Seed, Small, checked_dataclass
-from ..specimens.flow.channel import Channel
-from ..specimens.flow.suspension import Medium, State, Stepper, Suspension
+from ..specimens.flow.suspension import Channel, Medium, State, Stepper, Suspension
 from ..specimens.membrane.model import Elasticity, Membrane
 from ..specimens.membrane.rest import resting_cell
 from ..specimens.red_cells import DIAMETER, SHUFFLES, place_cells

@@ -19,8 +19,8 @@ from ..materials import HAEMOGLOBIN, DeltaBeta, Material, Transparent, material_
 from ..memory import memory_kept
 from ..model import Instrument, Model
 from ..optics.coherence import Spectrum
-from ..optics.detector import poisson
 from ..optics.noise import PHOTON_RANGE
+from ..optics.propagation import poisson
 from ..optics.sampling import resolving_oversample
 from ..progress import Advance
 from ..ranges import Many, Photons, Seed, checked_dataclass

@@ -16,7 +16,7 @@ from ..checks import require
 from ..geometry import Grid
 from ..projectors.voxels import projector_for
 from ..ranges import Weight, checked_dataclass
-from .quasi_newton import direction
+from .projected_gradient import direction
 from .whitened import WhitenedFrames
 
 MEMORY = 6

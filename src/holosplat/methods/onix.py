@@ -22,8 +22,7 @@ from ..fit.problem import Problem, Schedule, Term
 from ..fit.terms import Objective
 from ..fit.terms.field import AlignedFrames, AlignedLines
 from ..geometry import Grid
-from ..learning.start import images, seen_in
-from ..learning.weights import ONIX, PIXELNERF, read_aligned
+from ..learning.start import ONIX, PIXELNERF, images, read_aligned, seen_in
 from ..matter import DeltaBeta, Matter
 from ..ranges import Natural, Rate, Share, Weight, checked_dataclass
 from ..representations import AlignedNetwork, PixelAligned, PixelAlignedField, Stored

@@ -15,7 +15,7 @@ from ..fit.loop import Fit, Plan
 from ..fit.optimiser import Adam
 from ..fit.problem import Problem, Schedule, Term
 from ..fit.terms import Objective
-from ..fit.terms.equations import Equations, EquationTerm, SpaceTimeVariation
+from ..fit.terms.field import Equations, EquationTerm, SpaceTimeVariation
 from ..matter import Matter
 from ..ranges import Rate, Weight, checked_dataclass
 from ..representations import SpaceTime, SpaceTimeField, Stored

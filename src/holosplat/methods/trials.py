@@ -1,7 +1,12 @@
 """Decisions by unseen frames: hypotheses about light and noise, each carried as far as a volume in every fold of the
 coarse frames; on which side of its medium's the δ of matter lies (bodies in air or in a lighter medium, or holes in a
 denser one); and whether Gaussians or the surfaces cut out of them predict better. Training frames prefer the freer of
-these two kinds, which also explains by half a density what is in the wrong place."""
+these two kinds, which also explains by half a density what is in the wrong place.
+
+Of the contrast, the null is matter above its medium. Holes are taken where a volume of them predicts unseen frames
+better; matter on both sides, such as a shock and what is rarefied behind it, where this predicts them better than
+either.
+"""
 
 from __future__ import annotations
 

@@ -14,14 +14,14 @@ from ..checks import InputError, require
 from ..geometry import Grid
 from ..mesh import TriangleMesh
 from ..volume import Volume
-from .correlation import (
+from .images import (
     FIXED_THRESHOLD,
     fourier_shell_correlation,
     half_bit_threshold,
+    json_number,
     resolution,
     ring_counts,
 )
-from .images import json_number
 
 _CURVES = ("frequency", "fsc", "half_bit")
 

@@ -13,8 +13,7 @@ from torch import Tensor
 from ..checks import InputError, positive
 from ..mesh import TriangleMesh, areas, normals
 from ..ranges import Signed, Small, ranged
-from ..specimens.flow.channel import Channel
-from ..specimens.flow.suspension import Medium
+from ..specimens.flow.suspension import Channel, Medium
 from ..specimens.membrane.model import Elasticity, Membrane
 from ..specimens.membrane.rest import resting_cell
 from .membrane_fit import Bound, CellFlow, Unknowns, Velocity, advanced, dressed, scaled

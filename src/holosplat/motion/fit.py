@@ -16,7 +16,7 @@ from ..checks import at_least, in_range, positive, require
 from ..fit.loop import Fit, Plan
 from ..fit.optimiser import Adam, Group, Leaves, Optimiser
 from ..fit.problem import Problem, Schedule, Term
-from ..fit.quasi_newton import QuasiNewton
+from ..fit.projected_gradient import QuasiNewton
 from ..fit.residuals import Prediction
 from ..fit.run import Run
 from ..fit.terms import Objective

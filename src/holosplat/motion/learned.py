@@ -26,7 +26,7 @@ from torch import Tensor, nn
 
 from ..checks import InputError, as_written, require
 from ..io.atomic import atomic_path
-from ..learning.weights import Card, card_of, size_of, tensors_of
+from ..learning.start import Card, card_of, size_of, tensors_of
 from ..mesh import TriangleMesh, across
 from ..ranges import ManyOrNone, Natural, ranged
 from ..representations import MovingSurfaces

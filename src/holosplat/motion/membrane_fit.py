@@ -25,8 +25,7 @@ from torch.utils.checkpoint import checkpoint
 from ..bodies.rest_shape import moments, stretched_like
 from ..checks import require
 from ..mesh import TriangleMesh, areas, normals
-from ..specimens.flow.channel import Channel, contact_forces, wall_forces
-from ..specimens.flow.suspension import Medium, Suspension
+from ..specimens.flow.suspension import Channel, Medium, Suspension, contact_forces, wall_forces
 from ..specimens.membrane.model import Elasticity, Membrane
 from .measures import area
 

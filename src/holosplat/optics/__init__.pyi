@@ -4,14 +4,14 @@ from .camera import Illumination as Illumination
 from .coherence import Spectrum as Spectrum
 from .coherence import effective_geometry as effective_geometry
 from .coherence import source_blur as source_blur
-from .detector import bin_pixels as bin_pixels
-from .detector import blur as blur
-from .detector import poisson as poisson
 from .noise import NoiseModel as NoiseModel
+from .propagation import bin_pixels as bin_pixels
+from .propagation import blur as blur
 from .propagation import exit_wave as exit_wave
 from .propagation import exit_wave_minus_one as exit_wave_minus_one
 from .propagation import fresnel_propagate as fresnel_propagate
 from .propagation import fresnel_reach_px as fresnel_reach_px
 from .propagation import fresnel_transfer as fresnel_transfer
+from .propagation import poisson as poisson
 from .retrieval import invert_contrast as invert_contrast
 from .retrieval import retrieve_thickness as retrieve_thickness

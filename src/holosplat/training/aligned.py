@@ -16,8 +16,7 @@ from torch.nn.functional import leaky_relu, softplus
 
 from ..checks import InputError
 from ..geometry import Grid, Views, rotation_y
-from ..learning.start import images
-from ..learning.weights import ONIX, Card, write_aligned
+from ..learning.start import ONIX, Card, images, write_aligned
 from ..matter import Matter
 from ..methods.neural_field import visual_hull
 from ..methods.onix import AlignedFit

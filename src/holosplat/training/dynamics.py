@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from ..beamline.grow import SeriesFolder, read_compact
 from ..checks import as_written, require
 from ..io.atomic import read_json, write_rows
-from ..learning.weights import Card
+from ..learning.start import Card
 from ..motion.learned import (
     DEGREE,
     LONGEST,

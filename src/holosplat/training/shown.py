@@ -15,8 +15,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 from ..geometry import Grid, Views
 from ..io.atomic import write_rows
 from ..learning.network import FINE, Guess, Taps
-from ..learning.start import images, unexplained
-from ..learning.weights import Card
+from ..learning.start import Card, images, unexplained
 from .options import LossWeights, Ranges, ViewSampling
 from .sample import Sample, sample_of
 

@@ -19,7 +19,7 @@ from ..backends import require_device
 from ..checks import InputError, as_written, require
 from ..io.atomic import read_json, write_json, write_rows, write_state
 from ..learning.network import Guess
-from ..learning.weights import Card, write_weights
+from ..learning.start import Card, write_weights
 from ..tables import to_table
 from ..version import source_commit
 from ..workflows.provenance import environment

@@ -31,7 +31,7 @@ from ..preprocess.pixels import MOST_DEFECTS, filled
 from ..progress import Advance
 from ..ranges import checked_dataclass
 from ..scan import Scan
-from .air_light import AirLight, Look
+from .run_illumination import AirLight, Look
 
 RIM = 0.05
 """Width of a frame's rim, as a part of its shorter side, that `normalise = "rim"` takes to be free of the object."""

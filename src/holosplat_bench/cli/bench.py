@@ -196,7 +196,7 @@ def arena(
     from holosplat.io.lock import sole_writer
 
     from ..suite.arena.cases import FAMILIES
-    from ..suite.arena.entrants import CONTESTANTS
+    from ..suite.arena.contest import CONTESTANTS
     from ..suite.arena.run import Arena, ArenaFolder, chosen_tracks, entry_of, run_arena
     from ..suite.run import chosen
 

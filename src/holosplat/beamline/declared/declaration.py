@@ -16,8 +16,8 @@ from ...checks import InputError, in_range, require, shaped, whole_seed
 from ...geometry import Grid, Views, rotation_tilted, rotation_y
 from ...materials import DeltaBeta, parse_material
 from ...matter import MaterialPrior
-from ...optics.detector import poisson
 from ...optics.noise import PHOTON_RANGE
+from ...optics.propagation import poisson
 from ...ranges import Grams, Many, ManyOrNone, Metres, Photons, Pixels, Positive, Signed, Small, checked_dataclass
 from ...scan import Exposures, Scan, interleaved_split
 from ...specimens.drawn import Scene, Substances

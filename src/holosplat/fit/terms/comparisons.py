@@ -8,7 +8,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from ...metrics.correlation import shortest_side
+from ...metrics.images import shortest_side
 from ..fidelity import reference as plain
 
 

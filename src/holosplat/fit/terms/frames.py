@@ -13,8 +13,8 @@ from torch import Tensor
 from ...checks import InputError, require
 from ...matter import Matter
 from ...model import Instrument, Model
-from ...optics.detector import blur
 from ...optics.noise import noise_level, noise_levels, noise_share, sure_noise
+from ...optics.propagation import blur
 from ...optics.retrieval.spectra import sensitivity
 from ...ranges import Pixels, Share, Weight, checked_dataclass
 from ...scan import Exposures, Scan

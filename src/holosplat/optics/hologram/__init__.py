@@ -18,8 +18,7 @@ from torch import Tensor
 from ...backends import implementation
 from ...checks import require
 from ...units import wavelength
-from ..detector import gaussian_factors
-from ..propagation import angular_spectrum_factor, fresnel_factors, needs_angular_spectrum
+from ..propagation import angular_spectrum_factor, fresnel_factors, gaussian_factors, needs_angular_spectrum
 
 Refraction = Sequence[tuple[float, float]] | np.ndarray | Tensor
 """`(k δ, k β)` of each channel of matter per unit of its line integral: [C, 2] for all views, or [V, C, 2]."""

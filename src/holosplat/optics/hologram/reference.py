@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from torch import Tensor
 
-from ..detector import bin_pixels, blur
-from ..propagation import exit_wave_of, fresnel_propagate
+from ..propagation import bin_pixels, blur, exit_wave_of, fresnel_propagate
 
 if TYPE_CHECKING:
     from . import OpticalPath

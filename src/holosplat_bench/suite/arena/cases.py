@@ -16,7 +16,7 @@ from holosplat.io.guard import read_archive
 from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.io.volumes import read_volume, write_volume
 from holosplat.matter import DeltaBeta
-from holosplat.optics.detector import bin_pixels
+from holosplat.optics.propagation import bin_pixels
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.continuous import ContinuousScene
 from holosplat.specimens.scene import MeshScene

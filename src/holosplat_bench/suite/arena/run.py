@@ -26,8 +26,7 @@ from holosplat.workflows.provenance import environment, scan_hash
 
 from ..folder import BenchFolder, Row
 from .cases import SealedCase, prepare_case
-from .contest import TRACKS, WARM, Answer, Contestant, Outcome, Question, Track, compete
-from .entrants import BEST_PAIR, CONTESTANTS
+from .contest import BEST_PAIR, CONTESTANTS, TRACKS, WARM, Answer, Contestant, Outcome, Question, Track, compete
 from .history import Entry
 
 
