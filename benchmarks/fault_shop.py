@@ -17,7 +17,7 @@ from own_case import two_cells
 
 from holosplat.checks import InputError
 from holosplat.io.formats import read, read_volume_file
-from holosplat.io.pvd import read_pvd
+from holosplat.io.paraview import read_pvd
 from holosplat.io.vtk import read_meshes, write_mesh
 from holosplat.learning.start import read_weights
 from holosplat.mesh import TriangleMesh

@@ -40,7 +40,7 @@ from holosplat.motion.measures import half_sets
 from holosplat.motion.modes import DmdForecast, SindyForecast
 from holosplat.motion.track import TrackOptions, follow
 from holosplat.representations import MovingSurfaces
-from holosplat.representations.paths import TimeBasis
+from holosplat.representations.flow import TimeBasis
 from holosplat.specimens.scene import MeshSeries
 from holosplat.workflows.evaluate import render_object
 from motion import ANGLES, BODY, MATERIAL, PIXEL, SHAPE, cells_in_flow, imaged

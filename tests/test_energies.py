@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from holosplat.beamline.simulate import Simulation, frames_by_energy, simulate
+from helpers.energies import frames_by_energy
+from holosplat.beamline.simulate import Simulation, simulate
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views, rotation_y
 from holosplat.io.images import read_tiff, write_tiff

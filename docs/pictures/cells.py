@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.collections import PolyCollection
 
 from holosplat.io.atomic import atomic_path
-from holosplat.io.pvd import read_pvd
+from holosplat.io.paraview import read_pvd
 from holosplat.io.vtk import read_meshes
 from holosplat.mesh import TriangleMesh
 from holosplat.report.surface import camera

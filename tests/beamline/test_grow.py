@@ -12,7 +12,7 @@ import pytest
 from holosplat.beamline.grow import Growth, SeriesFolder, grow
 from holosplat.checks import InputError
 from holosplat.cli import main
-from holosplat.io.pvd import TimeStep, read_pvd, write_pvd
+from holosplat.io.paraview import TimeStep, read_pvd, write_pvd
 from holosplat.io.vtk import read_meshes
 from holosplat.specimens.membrane.model import Elasticity
 

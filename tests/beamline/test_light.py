@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from helpers.energies import frames_by_energy
 from helpers.imaging import cells, taken
 from holosplat.beamline.light import EVEN_LIGHT, UnevenLight, correlated_field
-from holosplat.beamline.simulate import Simulation, frames_by_energy, polychromatic_frames, simulate, simulated_frames
+from holosplat.beamline.simulate import Simulation, polychromatic_frames, simulate, simulated_frames
 from holosplat.checks import InputError
 from holosplat.optics.coherence import Spectrum
 

@@ -18,7 +18,7 @@ from helpers.moving_ellipsoids import MATERIAL, PIXEL, STEP, TIMES, ellipsoid, s
 from helpers.pictures import undrawn
 from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.io.objects import read_object
-from holosplat.io.pvd import read_pvd
+from holosplat.io.paraview import read_pvd
 from holosplat.matter import Matter
 from holosplat.motion.track import Followed
 from holosplat.representations import MovingSurfaces, TimeBasis

@@ -17,7 +17,7 @@ from helpers.pictures import undrawn
 from holosplat.geometry import Grid
 from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.io.objects import read_object
-from holosplat.io.pvd import read_pvd
+from holosplat.io.paraview import read_pvd
 from holosplat.io.volumes import read_volume, write_voxels
 from holosplat.io.vtk import read_meshes
 from holosplat.representations import MovingSurfaces

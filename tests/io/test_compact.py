@@ -16,8 +16,8 @@ from holosplat.io.objects import read_object, write_compact, write_object
 from holosplat.io.ome import write_ome_tiff
 from holosplat.matter import DeltaBeta, Matter
 from holosplat.representations import GaussianCloud, MovingSurfaces, Stored, SurfaceMesh, VoxelGrid
+from holosplat.representations.flow import TimeBasis
 from holosplat.representations.gaussians import raw_of
-from holosplat.representations.paths import TimeBasis
 from holosplat.specimens.red_cells import icosphere
 from holosplat.volume import Volume
 

@@ -22,7 +22,7 @@ from holosplat.io.half_acquisition import Tube
 from holosplat.io.leftovers import LOCK
 from holosplat.io.lock import sole_writer, writer_of
 from holosplat.io.ome import read_ome_tiff, write_ome_tiff
-from holosplat.io.pvd import find_snapshots, read_pvd
+from holosplat.io.paraview import find_snapshots, read_pvd
 from holosplat.io.reading import Reading, ends_of, marked, read_angles
 from holosplat.io.stacks import all_images, stack_of
 from holosplat.io.table import Table

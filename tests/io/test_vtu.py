@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from holosplat.checks import InputError
-from holosplat.io.vti import write_vtu
+from holosplat.io.paraview import write_vtu
 from holosplat.io.vtk import read_meshes
 from holosplat.matter import DeltaBeta, Matter
 from holosplat.mesh import TriangleMesh

@@ -15,7 +15,7 @@ from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta, MaterialPrior, Matter
 from holosplat.methods import Gaussians, Task
 from holosplat.methods import first_surfaces as levels
-from holosplat.methods.assumed import KnownLevels
+from holosplat.methods.ground import KnownLevels
 from holosplat.methods.surface_fit import SurfaceOptions, cut_surfaces
 from holosplat.representations import SurfaceMesh, VoxelGrid
 from holosplat.scan import Exposures, Scan

@@ -22,8 +22,8 @@ from holosplat.report.run import phase_ends
 from holosplat.report.view3d import view as packing
 from holosplat.report.view3d.view import View3D, ViewPart, binned, html, packed, part_of, raster_of, volume_part
 from holosplat.representations import GaussianCloud, MovingSurfaces, SurfaceMesh
+from holosplat.representations.flow import TimeBasis
 from holosplat.representations.gaussians import raw_of
-from holosplat.representations.paths import TimeBasis
 from holosplat.scan import Exposures
 from holosplat.specimens.red_cells import icosphere
 from holosplat.volume import Volume

@@ -12,7 +12,7 @@ from holosplat.beamline.series import SeriesFiles, Timing, held_out, read_series
 from holosplat.beamline.simulate import Filling, Shutter
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
-from holosplat.io.pvd import find_snapshots
+from holosplat.io.paraview import find_snapshots
 from holosplat.io.vtk import read_meshes, write_mesh
 from holosplat.materials import DeltaBeta
 from holosplat.mesh import TriangleMesh

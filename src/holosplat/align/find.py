@@ -11,7 +11,7 @@ import torch
 from ..checks import require
 from ..inference import Decision, Score
 from ..matter import DeltaBeta, Known, MaterialPrior
-from ..methods.assumed import assumed_material
+from ..methods.ground import assumed_material
 from ..model import Alignment
 from ..optics.background import LightOptions
 from ..progress import Advance, Progress

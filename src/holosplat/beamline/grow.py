@@ -15,7 +15,7 @@ from ..checks import InputError, as_written, in_range, require
 from ..fit.run import interrupts_held
 from ..io.atomic import atomic_path, read_json, require_new, write_json
 from ..io.guard import read_archive
-from ..io.pvd import TimeStep, write_pvd
+from ..io.paraview import TimeStep, write_pvd
 from ..io.vtk import write_mesh
 from ..mesh import TriangleMesh
 from ..progress import Advance

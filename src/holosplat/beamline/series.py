@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from ..checks import in_range, require
-from ..io.pvd import find_snapshots
+from ..io.paraview import find_snapshots
 from ..progress import Advance
 from ..ranges import Frequency, Seconds, Signed, Weight, checked_dataclass
 from ..specimens.scene import ROUNDING, MeshSeries
@@ -91,7 +91,7 @@ def read_series(
 ) -> tuple[MeshSeries, np.ndarray]:
     """The moving bodies, filled and centred, and the times [T] of the frames [s], of which the first is 0.
 
-    Only the snapshots that the frames need are read (`io.pvd.find_snapshots` says how files are named). Errors:
+    Only the snapshots that the frames need are read (`io.paraview.find_snapshots` says how files are named). Errors:
     `InputError` for files that cannot be read, bodies that change their triangles or jump (`MeshSeries`), and times
     beyond the snapshots. `on_progress(fraction)` is called after each snapshot.
     """

@@ -280,21 +280,6 @@ def polychromatic_frames(
         yield detect(np.tensordot(spectrum.weights, np.stack(of_energies), 1), i)
 
 
-def frames_by_energy(
-    matter_at: Callable[[float], Object], exposures: Exposures, how: Simulation
-) -> Iterator[np.ndarray]:
-    """Frames [H, W] float32 as `simulate.simulated_frames`, of exposures of several energies.
-
-    `matter_at(energy_kev)` is the object with its δ and β at that energy; each frame uses its own energy.
-    """
-    quiet = how.quiet(exposures)
-    detect = how.detector(exposures)
-    for i, energy in enumerate(exposures.energy_kev.tolist()):
-        own = replace(exposures[[i]], reference_kev=None)
-        (frame,) = simulated_frames(matter_at(energy), own, quiet)
-        yield detect(frame, i)
-
-
 def refilled(matter: MeshScene | MeshSeries, filling: Filling, energy_kev: float) -> MeshScene | MeshSeries:
     """The same bodies, filled with their materials' δ and β at `energy_kev` [keV]."""
     if isinstance(matter, MeshSeries):

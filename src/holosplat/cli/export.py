@@ -13,7 +13,7 @@ from tyro.conf import Positional
 from ..checks import InputError, as_written, in_range, require
 from ..ranges import Pixels, checked_dataclass
 from .places import Output
-from .sentence import say
+from .progress import say
 
 if TYPE_CHECKING:
     from ..geometry import Grid
@@ -148,8 +148,8 @@ def _require_free(timed: Sequence[Path], every: Sequence[int]) -> None:
 
 def _export_series(path: Path, steps: Sequence[tuple[float, Path]], grid: Grid | None, of: Contents) -> None:
     """Write what opens files of all times, if their format has such."""
+    from ..io.paraview import TimeStep, write_pvd
     from ..io.plain_values import write_xdmf
-    from ..io.pvd import TimeStep, write_pvd
 
     suffix = SERIES.get(path.suffix.lower())
     if suffix is None:
@@ -218,8 +218,8 @@ def _export_splats(result: Reconstruction, out: Path) -> None:
 
 
 def _export_bodies(one: Moment, out: Path) -> None:
+    from ..io.paraview import write_vtu
     from ..io.solids import write_glb, write_stl
-    from ..io.vti import write_vtu
     from .track import write_bodies
 
     found = one.result.object
@@ -270,7 +270,7 @@ def _export_volume(
     from ..scan import PIXEL_RANGE_M
     from ..workflows.export import export as write
     from ..workflows.rehearsal import matter_of
-    from .sentence import tell
+    from .progress import tell
 
     shape, voxel_size = sampling
     with as_written(folder.summary, "what reconstruct wrote"):

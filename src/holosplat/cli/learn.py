@@ -10,8 +10,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from ..ranges import Jobs, Seed, Within
 from ..training.options import Ranges, TrainOptions
 from .places import Kept, Output
-from .progress import ProgressBar
-from .sentence import interruptible, tell
+from .progress import ProgressBar, interruptible, tell
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -22,8 +22,7 @@ from .options import (
     NoiseOptions,
 )
 from .places import Output
-from .progress import ProgressBar
-from .sentence import say, tell_simulation
+from .progress import ProgressBar, say, tell_simulation
 from .specimen import NO_SPECTRUM, SourceOptions, SpecimenOptions
 
 if TYPE_CHECKING:
@@ -227,7 +226,7 @@ def _specimen(
 
     from ..beamline.series import read_series
     from ..beamline.simulate import read_scene
-    from ..io.pvd import COLLECTION, seeming_snapshots
+    from ..io.paraview import COLLECTION, seeming_snapshots
 
     if timing is None:
         files.require_static()

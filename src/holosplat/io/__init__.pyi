@@ -5,8 +5,8 @@ from .formats import read as read
 from .nxtomo import read_scan as read_scan
 from .nxtomo import scan_writer as scan_writer
 from .nxtomo import write_scan as write_scan
-from .pvd import read_pvd as read_pvd
-from .pvd import write_pvd as write_pvd
+from .paraview import read_pvd as read_pvd
+from .paraview import write_pvd as write_pvd
 from .volumes import read_volume as read_volume
 from .volumes import write_volume as write_volume
 from .volumes import write_voxels as write_voxels

@@ -28,6 +28,7 @@ from .angles import in_order
 from .hdf5 import open_hdf5
 from .hdf5_guard import is_vouched
 from .ome import TIFF_SUFFIXES, ZARR_SUFFIX, read_ome_tiff, read_ome_zarr, require_zarr, write_ome_tiff, write_ome_zarr
+from .paraview import read_vti, write_vti
 from .plain_values import both, read_mrc, read_nrrd, write_mrc, write_nrrd
 from .raw_file import Loader, ScanFile, folder_with
 from .reading import Reading
@@ -35,7 +36,6 @@ from .stacks import all_images
 from .stored_frames import Mended, with_fields
 from .table import Table
 from .volumes import ALONE, REFRACTION, VOXEL_RANGE_M, Beside, Contents, Stored, read_stored, write_voxels
-from .vti import read_vti, write_vti
 
 SOURCE, SUMMARY = "source.json", "summary.json"
 

@@ -29,7 +29,7 @@ from ..progress import Progress
 from ..representations import Stored, VoxelGrid
 from ..scan import Exposures, Scan
 from ..volume import Object
-from .assumed import assumed_material
+from .ground import assumed_material
 
 DRAWS = 16
 """Of the noise, for what it leaves of the matter: a standard deviation by so many is right to a sixth."""

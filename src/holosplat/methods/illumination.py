@@ -22,9 +22,9 @@ from ..optics.background import FLUX, Light, LightOptions
 from ..progress import Progress
 from ..representations import VoxelGrid
 from ..scan import Scan
-from .assumed import assumed_material
 from .auto import Auto
 from .cross_validation import BY_FISSION, EFFORT, FirstVolumes, predicted_frames
+from .ground import assumed_material
 from .levels import SHOWN, TrialFits, blind
 from .method import Method, Task, first_of_task
 from .trials import (

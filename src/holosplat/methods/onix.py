@@ -28,8 +28,7 @@ from ..ranges import Natural, Rate, Share, Weight, checked_dataclass
 from ..representations import AlignedNetwork, PixelAligned, PixelAlignedField, Stored
 from ..representations.neural_field import grown
 from ..scan import Scan
-from .assumed import assumed_material
-from .ground import ExtraTerm, ground
+from .ground import ExtraTerm, assumed_material, ground
 from .method import Method, Stage, Task
 from .neural_field import visual_hull
 from .volume import binning

@@ -21,7 +21,7 @@ from ..progress import Advance
 from ..projectors.voxels import rows_match
 from ..ranges import Positive, Signed, checked_dataclass
 from ..representations import Stored, VoxelGrid
-from .assumed import assumed_material
+from .ground import assumed_material
 from .method import Method, Stage, Task
 
 

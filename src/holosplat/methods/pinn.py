@@ -20,8 +20,7 @@ from ..matter import Matter
 from ..ranges import Rate, Weight, checked_dataclass
 from ..representations import SpaceTime, SpaceTimeField, Stored
 from ..representations.space_time import FLOW
-from .assumed import assumed_material
-from .ground import ExtraTerm, Ground, ground
+from .ground import ExtraTerm, Ground, assumed_material, ground
 from .method import Method, Stage, Task
 
 EACH, FLOW_ALONE, THROUGH_WAVES = "each time by itself", "flow of these", "field through the waves"

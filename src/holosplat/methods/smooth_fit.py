@@ -26,7 +26,7 @@ from ..optics.noise import NoiseModel
 from ..optics.sampling import fringe_sampling
 from ..representations import VoxelGrid
 from ..scan import Scan
-from .assumed import KnownLevels
+from .ground import KnownLevels
 from .modulation import modulated, unshrunk
 
 EXPLAINED, WEAKER = 0.95, 0.98

@@ -21,8 +21,8 @@ from ..optics.retrieval.spectra import contrast_level
 from ..ranges import Weight, checked_dataclass
 from ..representations import Stored, VoxelGrid
 from ..scan import Scan
-from .assumed import assumed_material
 from .cross_validation import predicted_frames
+from .ground import assumed_material
 from .method import Method, Stage, Task, first_of_task
 from .smooth_fit import SmoothFit, SmoothPlan
 

@@ -24,8 +24,7 @@ from ..optics.sampling import fringe_sampling
 from ..ranges import Weight, checked_dataclass
 from ..representations import Stored, VoxelGrid
 from ..scan import Scan
-from .assumed import assumed_material
-from .ground import ExtraTerm, ground
+from .ground import ExtraTerm, assumed_material, ground
 from .method import Method, Stage, Task
 
 ABSORPTION_REACH = 10.0

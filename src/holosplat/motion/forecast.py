@@ -15,7 +15,7 @@ from ..inference import Decision, Score, select
 from ..mesh import TriangleMesh, across, areas
 from ..ranges import ranged
 from ..representations import MovingSurfaces, TimeBasis
-from ..representations.paths import path_positions
+from ..representations.flow import path_positions
 
 PARTS = ("centre", "turn", "stretch", "rest")
 MOST_REST = 1

@@ -12,13 +12,12 @@ from ..matter import Matter
 from ..plugins import Extended
 from ..volume import LineIntegrals, TrainableObject
 from .aligned_network import AlignedNetwork, PixelAligned
-from .flow import Fading, Flow, Lattice
+from .flow import Fading, Flow, Lattice, TimeBasis
 from .gaussians import GaussianCloud
 from .initialise import approximate, at_pitch, cloud_from_shares, cloud_from_volume, freed, random_cloud
 from .isosurface import isosurface
 from .moving_gaussians import MovingGaussians
 from .neural_field import Network, NeuralField
-from .paths import TimeBasis
 from .perceptron import Encoding
 from .pixel_aligned import PixelAlignedField
 from .space_time import SpaceTime, SpaceTimeField

@@ -15,9 +15,8 @@ from ..geometry import Grid, Poses, Views
 from ..matter import Matter
 from ..projectors.splat.reference import rotation_matrices
 from ..volume import LineIntegrals, Volume
-from .flow import Flow
+from .flow import Flow, TimeBasis
 from .gaussians import PARAMETERS, GaussianCloud
-from .paths import TimeBasis
 
 ALIKE = 1e-3
 """Relative difference of two variances below which a turn within their plane gives a gradient no longer: it changes

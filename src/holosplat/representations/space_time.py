@@ -20,8 +20,7 @@ from ..matter import Matter
 from ..ranges import Pixels, checked_dataclass
 from ..tables import from_table, to_table
 from ..volume import LineIntegrals, Volume
-from .flow import Lattice
-from .paths import TimeBasis
+from .flow import Lattice, TimeBasis
 from .perceptron import Jet, VelocityNetwork
 from .voxels import VoxelGrid, along_axes
 

@@ -18,7 +18,7 @@ from ..matter import Matter
 from ..mesh import TriangleMesh, shell_labels, winding_number
 from ..projectors.surface import surface_occupancy, surface_thickness
 from ..volume import LineIntegrals, Volume
-from .paths import TimeBasis, path_positions
+from .flow import TimeBasis, path_positions
 
 
 class SurfaceMesh:

@@ -1,5 +1,5 @@
-"""The folder of a series: its plan, a folder for each task, the state of each in words, and a row for each time; and a
-folder in which scans appear."""
+"""The folder of a series: its plan, a folder for each task, the state of each, and a row for each time; and a folder in
+which scans appear."""
 
 from __future__ import annotations
 

@@ -169,17 +169,12 @@ class Capsule:
         """Of shell and core together, 4π/3 abc [m³]."""
         return 4 / 3 * np.pi * float(np.prod(self.half_axes))
 
-    @property
-    def core_volume(self) -> float:
-        """Of the core, 4π/3 (a - t)(b - t)(c - t) [m³] with the shell's thickness t."""
-        return 4 / 3 * np.pi * float(np.prod(self.half_axes - self.shell))
-
     def outer(self, subdivisions: int = 4, name: str = "capsule") -> TriangleMesh:
         """Closed mesh of the outer surface, enclosing exactly `volume`."""
         return self._ellipsoid(self.half_axes, subdivisions, name)
 
     def core(self, subdivisions: int = 4, name: str = "core") -> TriangleMesh:
-        """Closed mesh of the core's surface, wound outwards, enclosing exactly `core_volume`."""
+        """Closed mesh of the core's surface, wound outwards, enclosing exactly 4π/3 (a - t)(b - t)(c - t)."""
         return self._ellipsoid(self.half_axes - self.shell, subdivisions, name)
 
     def _ellipsoid(self, half_axes: np.ndarray, subdivisions: int, name: str) -> TriangleMesh:
@@ -231,11 +226,6 @@ class Foam:
 
     drop: Ball
     bubbles: tuple[Ball, ...]
-
-    @property
-    def liquid_volume(self) -> float:
-        """The drop's volume without its bubbles' [m³]."""
-        return self.drop.volume - sum(bubble.volume for bubble in self.bubbles)
 
 
 def random_foam(

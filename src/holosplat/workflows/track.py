@@ -13,11 +13,11 @@ from ..checks import as_written, require
 from ..fit.residuals import Prediction
 from ..fit.run import Run
 from ..io.atomic import atomic_folder, write_rows
-from ..io.pvd import TimeStep, write_pvd
+from ..io.paraview import TimeStep, write_pvd
 from ..io.vtk import write_mesh
 from ..matter import KnownSeveral, MaterialPrior
 from ..methods import Task
-from ..methods.assumed import assumed_material
+from ..methods.ground import assumed_material
 from ..methods.illumination import prepared
 from ..motion.body_tracker import Followed, require_times
 from ..motion.elastic import Rest, strain_energy

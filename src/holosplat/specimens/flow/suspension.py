@@ -77,10 +77,6 @@ class Channel:
         series = sum(math.tanh(n * math.pi * b / (2 * a)) / n**5 for n in odd)
         return 4 / 3 * b * a**3 * self.pressure_gradient(1.0) * (1 - 192 * a / (math.pi**5 * b) * series)
 
-    def mean_speed(self) -> float:
-        """Flow rate over cross-section [m/s]."""
-        return self.flow_rate() / (self.box[1] * self.box[2])
-
     def shear_rate(self) -> float:
         """Greatest shear rate of a plane channel as wide as the shorter side, 2 peak/a [1/s]."""
         return 2 * self.peak / self.halves[0]
@@ -190,17 +186,6 @@ def pairs_at_a_time(device: torch.device) -> int:
 
 BLOB = 0.39
 """ε in square roots of a node's area, at which a ball of evenly spaced nodes drags as Stokes says (tests)."""
-CHUNK = 512
-"""Targets handled at a time by `stokeslet_velocity`: rows that stay in the processor's cache."""
-
-
-def stokeslet_velocity(targets: Tensor, sources: Tensor, forces: Tensor, blob: float, viscosity: float) -> Tensor:
-    """Velocity [T, 3] [m/s] at `targets` [T, 3] of the `forces` [S, 3] [N] at `sources` [S, 3] [m].
-
-    blob: ε [m]; viscosity [Pa s].
-    """
-    found = [_one_way(part, sources, forces, blob) for part in targets.split(CHUNK)]
-    return torch.cat(found) / (8 * math.pi * viscosity)
 
 
 def mutual_velocity(first: Tensor, second: Tensor, forces: tuple[Tensor, Tensor], blob: float) -> tuple[Tensor, Tensor]:
@@ -219,8 +204,8 @@ def mutual_velocity(first: Tensor, second: Tensor, forces: tuple[Tensor, Tensor]
     return on_first, on_second
 
 
-def _one_way(targets: Tensor, sources: Tensor, forces: Tensor, blob: float) -> Tensor:
-    """8πμ times the velocity [..., T, 3]."""
+def one_way_velocity(targets: Tensor, sources: Tensor, forces: Tensor, blob: float) -> Tensor:
+    """8πμ times the velocity [..., T, 3] at `targets` of the `forces` [..., S, 3] [N] at `sources`; blob: ε [m]."""
     square = _squares(targets, sources, blob)
     cube = square.rsqrt() / square
     along = cube * (targets @ forces.mT - (sources * forces).sum(-1).unsqueeze(-2))
@@ -303,7 +288,7 @@ class Suspension:
         local = nodes - centres[:, None]  # small numbers, whose squares keep their digits
         some = max(1, pairs_at_a_time(nodes.device) // nodes.shape[1] ** 2)
         parts = zip(local.split(some), forces.split(some))
-        total = torch.cat([_one_way(x, x, f, self.blob) for x, f in parts])
+        total = torch.cat([one_way_velocity(x, x, f, self.blob) for x, f in parts])
         one, other, way, weight = self._neighbours(centres)
         for k in torch.arange(len(one), device=nodes.device).split(some):
             i, j = one[k], other[k]

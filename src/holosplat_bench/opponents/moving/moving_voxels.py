@@ -15,7 +15,7 @@ from holosplat.checks import require
 from holosplat.display import of_object
 from holosplat.geometry import Grid, Poses, Views
 from holosplat.matter import Matter
-from holosplat.representations.paths import TimeBasis
+from holosplat.representations.flow import TimeBasis
 from holosplat.representations.voxels import VoxelGrid
 from holosplat.volume import LineIntegrals, Volume
 
