@@ -128,8 +128,8 @@ def once(memory: Once) -> Iterator[None]:
         "illumination.decided": light,
         "illumination.decide_sign": sign,
         "illumination.decide_sides": sides,
-        "assumed.estimate_ratio": ratio,
-        "assumed.estimate_delta": delta,
+        "ground.estimate_ratio": ratio,
+        "ground.estimate_delta": delta,
         "start.material_of_levels": level,
         **{f"{module}.holographic_tv": begin for module in ("start", "volume", "voxels")},
     }

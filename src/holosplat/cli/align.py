@@ -14,7 +14,8 @@ from ..ranges import Small, checked_dataclass
 from .light import Degrees, LightFlags, Pixels, Share
 from .options import MaterialOptions, PriorOptions
 from .places import Output
-from .progress import ProgressBar, put, say, tell_frames
+from .progress import ProgressBar
+from .sentence import put, say, tell_frames
 
 if TYPE_CHECKING:
     import numpy as np

@@ -16,7 +16,8 @@ from .align import AS_SAID, RefineOptions
 from .light import RunLightFlags
 from .options import BeamlineOptions, MethodOptions, PriorOptions
 from .places import Output
-from .progress import INTERRUPTED, ProgressBar, put, say, tell_frames, tell_reconstruction
+from .progress import ProgressBar
+from .sentence import INTERRUPTED, put, say, tell_frames, tell_reconstruction
 from .simulate import TruthOptions
 from .view import LiveFlags, watched
 

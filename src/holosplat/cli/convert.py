@@ -29,7 +29,8 @@ from ..workflows.run_illumination import FixedPatternOptions, flatfield_correcte
 from .light import LightFlags
 from .options import PriorOptions
 from .places import Output
-from .progress import ProgressBar, say
+from .progress import ProgressBar
+from .sentence import say
 
 if TYPE_CHECKING:
     from ..baselines.retrieve import Retrieved

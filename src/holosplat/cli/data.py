@@ -12,7 +12,7 @@ from ..checks import InputError
 from ..io.reading import Reading
 from ..workflows.run_folder import check as look
 from .places import Output, with_checked_arguments
-from .progress import say
+from .sentence import say
 
 
 def _list() -> None:

@@ -24,8 +24,9 @@ from ..ranges import checked_later
 from ..version import __version__
 from .help import ALL, CONFIG, HELP, acts_of, overview, page, parser_of
 from .places import with_checked_arguments
-from .progress import INTERRUPTED, end_as_on_interrupt, give_up, logged, say, say_notes
+from .progress import end_as_on_interrupt, logged, say_notes
 from .resume import resumed
+from .sentence import INTERRUPTED, give_up, say
 
 LONGEST = 200
 """Characters of another program's message, at most."""

@@ -13,7 +13,7 @@ from tyro.conf import Positional
 from ..checks import InputError, as_written, in_range, require
 from ..ranges import Pixels, checked_dataclass
 from .places import Output
-from .progress import say
+from .sentence import say
 
 if TYPE_CHECKING:
     from ..geometry import Grid
@@ -270,7 +270,7 @@ def _export_volume(
     from ..scan import PIXEL_RANGE_M
     from ..workflows.export import export as write
     from ..workflows.rehearsal import matter_of
-    from .progress import tell
+    from .sentence import tell
 
     shape, voxel_size = sampling
     with as_written(folder.summary, "what reconstruct wrote"):

@@ -42,7 +42,8 @@ from ..workflows.reconstruction import instants_of, reconstruction_at, where_fou
 from ..workflows.run_folder import RunFolder, claimed
 from ..workflows.track import COLLECTION, TRACKS
 from .places import Output
-from .progress import ProgressBar, interruptible, put, say, tell
+from .progress import ProgressBar
+from .sentence import interruptible, put, say, tell
 
 
 @checked_dataclass

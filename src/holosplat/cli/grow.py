@@ -12,7 +12,8 @@ from ..planning.needs import Needs
 from ..specimens.membrane.rest import nodes_of
 from ..units import in_percent
 from .places import Output
-from .progress import ProgressBar, interruptible, say, tell
+from .progress import ProgressBar
+from .sentence import interruptible, say, tell
 
 
 def grow(out: Output, what: Growth, resume: bool = False) -> None:

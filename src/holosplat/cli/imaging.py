@@ -17,7 +17,8 @@ from ..workflows.correct import FAR, Corrected, CorrectionOptions
 from ..workflows.correct import correct as correct_file
 from ..workflows.join import join as join_files
 from .places import Output
-from .progress import ProgressBar, say
+from .progress import ProgressBar
+from .sentence import say
 
 OFF = 0.02
 """How far air may be off 1 before it is warned of."""

@@ -10,7 +10,8 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from ..ranges import Jobs, Seed, Within
 from ..training.options import Ranges, TrainOptions
 from .places import Kept, Output
-from .progress import ProgressBar, interruptible, tell
+from .progress import ProgressBar
+from .sentence import interruptible, tell
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -24,8 +24,8 @@ from ..tables import read_table, shown
 from .entry import command
 from .help import CONFIG, Option, is_essential, options_of, parser_of, wrap
 from .places import Place, is_run, of_times, places_of, require_apart
-from .progress import say
 from .resume import OF_ONE_CALL, is_made_by
+from .sentence import say
 
 STAGES = ("correct", "align", "reconstruct", "export")
 """Commands that a pipeline file may have as tables, in the order in which they run."""

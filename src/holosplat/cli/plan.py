@@ -19,7 +19,8 @@ from ..ranges import Grams, Many, Metres, Positive, Signed, Small, checked_datac
 from ..units import in_percent
 from .options import MaterialOptions
 from .places import Output
-from .progress import ProgressBar, say
+from .progress import ProgressBar
+from .sentence import say
 
 if TYPE_CHECKING:
     from ..mesh import TriangleMesh

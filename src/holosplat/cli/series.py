@@ -25,7 +25,7 @@ from ..tables import to_table
 from .light import RunLightFlags
 from .options import MethodOptions, PriorOptions
 from .places import Kept, Output, with_checked_arguments
-from .progress import interruptible, put, say, tell_each_time
+from .sentence import interruptible, put, say, tell_each_time
 from .track import BodyFlags, MotionFlags
 
 if TYPE_CHECKING:

@@ -22,7 +22,8 @@ from .options import (
     NoiseOptions,
 )
 from .places import Output
-from .progress import ProgressBar, say, tell_simulation
+from .progress import ProgressBar
+from .sentence import say, tell_simulation
 from .specimen import NO_SPECTRUM, SourceOptions, SpecimenOptions
 
 if TYPE_CHECKING:

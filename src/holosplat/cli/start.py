@@ -12,7 +12,7 @@ import sys
 from traceback import walk_tb
 
 from ..io.room import left_by_limits
-from .progress import give_up
+from .sentence import give_up
 
 MAPPED, RESIDENT = 1.0e9, 0.4e9
 """Bytes of address space and of memory that commands take until they begin with their work."""

@@ -43,8 +43,9 @@ from ..workflows.track import track as follow
 from .light import LightFlags
 from .options import PriorOptions
 from .places import Output
-from .progress import ProgressBar, interruptible, put, say, tell_frames
+from .progress import ProgressBar
 from .scans import run_and_scan
+from .sentence import interruptible, put, say, tell_frames
 
 
 @checked_dataclass

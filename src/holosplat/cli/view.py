@@ -18,7 +18,7 @@ from ..io.reading import Reading, Told
 from ..progress import FitProgress, FitState
 from ..ranges import Many, Within, checked_dataclass
 from .places import Output
-from .progress import put, say
+from .sentence import put, say
 
 if TYPE_CHECKING:
     from ..report.compare import Side

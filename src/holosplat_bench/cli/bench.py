@@ -13,7 +13,8 @@ from tyro.conf import Positional, arg, subcommand
 
 from holosplat.checks import require
 from holosplat.cli.places import Kept, with_checked_arguments
-from holosplat.cli.progress import INTERRUPTED, ProgressBar, interruptible, say, tell
+from holosplat.cli.progress import ProgressBar
+from holosplat.cli.sentence import INTERRUPTED, interruptible, say, tell
 from holosplat.ranges import Seed
 
 if TYPE_CHECKING:

@@ -1,0 +1,101 @@
+"""What commands say on standard error: sentences, what a job takes, held against what there is before it begins, and
+the sentence of the end."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
+
+if TYPE_CHECKING:
+    from ..matter import MaterialPrior, MatterKind
+    from ..methods import Method
+    from ..planning.needs import Needs
+    from ..scan import Exposures, Scan
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it."""
+
+
+def put(lines: Iterable[str]) -> None:
+    """Print lines on standard output."""
+    for line in lines:
+        print(line)
+
+
+def say(text: str) -> None:
+    """Print `text` on standard error."""
+    print(text, file=sys.stderr)
+
+
+@contextmanager
+def interruptible(sentence: Callable[[], str]) -> Iterator[None]:
+    """In the block, Ctrl-C says a `sentence`, and ends with `INTERRUPTED`."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        say(sentence())
+        raise SystemExit(INTERRUPTED) from None
+
+
+def give_up(sentence: str) -> NoReturn:
+    """Say `sentence` on standard error, and end with 2."""
+    text = f"holosplat: {sentence}\n"
+    sys.stderr.write(text.encode("utf-8", "backslashreplace").decode("utf-8"))
+    raise SystemExit(2) from None
+
+
+def tell_reconstruction(
+    scan: Scan, out: Path, method: Method, prior: MaterialPrior, matter: MatterKind | None, whole: bool = False
+) -> None:
+    """Say what the reconstruction of the training frames of `scan` takes; `InputError` where there is less. Of a known
+    material frames nearly always say that it has levels. whole: whether it works on whole frames in any case."""
+    from ..matter import Known
+    from ..planning.needs import Sizes, of_reconstruction
+    from ..planning.scan_facts import seen_of, smaller
+
+    exposures = scan.exposures[~scan.is_test]
+    if len(exposures) == 0:
+        return  # there is nothing to fit, as the fit will say
+    kind = matter or ("levels" if isinstance(prior, Known) else None)
+    needs = of_reconstruction(Sizes.of(exposures), method, kind, seen_of(scan, method, whole), prior.fixes_ratio)
+    if needs is not None:
+        tell(method.kind, needs, out, smaller(exposures, method, kind))
+
+
+def tell_each_time(exposures: Exposures, out: Path, method: Method, matter: MatterKind | None) -> None:
+    """The same where each time is reconstructed by itself."""
+    from ..planning.acts import of_each_time, one_time, times_of
+    from ..planning.scan_facts import smaller
+
+    if len(exposures) == 0:
+        return
+    needs = of_each_time(exposures, method, matter)
+    if needs is not None:
+        others = smaller(one_time(exposures), method, matter)
+        tell(f"{times_of(exposures)} times", needs, out, ((how, one.times(times_of(exposures))) for how, one in others))
+
+
+def tell_simulation(exposures: Exposures, out: Path, samples: int, frames: int) -> None:
+    """The same for a simulation of `frames`, with so many wave samples along a pixel."""
+    from ..planning.acts import of_simulation
+
+    tell("the simulation", of_simulation(exposures, samples, frames), out)
+
+
+def tell(what: str, needs: Needs, out: Path, others: Iterable[tuple[str, Needs]] = ()) -> None:
+    """Say what a job takes; `InputError` where there is less, with the first of the `others` that fits."""
+    from ..planning.needs import require_room
+
+    require_room(needs, out, others)
+    say(f"{what} {needs.line()}")
+
+
+def tell_frames(what: str, exposures: Exposures, out: Path, of: Callable[[Exposures], Needs]) -> None:
+    """The same of a job of which `of` says what it takes for such frames; larger pixels may fit."""
+    from ..planning.scan_facts import coarser
+
+    if len(exposures):  # without any there is nothing to do, as the job will say
+        tell(what, of(exposures), out, coarser(exposures, of))
