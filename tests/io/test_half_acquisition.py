@@ -16,7 +16,7 @@ from holosplat.io.half_acquisition import stitched
 from holosplat.io.nxtomo import write_scan
 from holosplat.io.reading import Reading
 from holosplat.materials import parse_material
-from holosplat.optics.retrieval.linear import contact_thickness
+from holosplat.optics.retrieval.contact import contact_thickness
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens import random_cells
 from holosplat.specimens.scene import MeshScene

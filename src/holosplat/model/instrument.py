@@ -15,7 +15,7 @@ from ..checks import require
 from ..geometry import Poses
 from ..optics.coherence import quadrature
 from ..optics.hologram import OpticalPath, Refraction, hologram, optical_path
-from ..optics.retrieval.linear import beside_faces
+from ..optics.retrieval.contact import beside_faces
 from ..optics.sampling import padding
 from ..scan import Exposures, far_from_edges
 from ..units import wavenumber

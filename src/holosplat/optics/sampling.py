@@ -125,7 +125,7 @@ class SharedPoses:
 
     of: [V] int, the projection of each; any: whether there are such frames. Poses are one whose turn to each other
     moves the edge of the field by less than half a pixel, as of frames that were aligned one by one. Where poses are
-    taken at one distance alone, each frame stays by itself. Shifts may differ: `retrieval.linear` moves frames to each
+    taken at one distance alone, each frame stays by itself. Shifts may differ: `retrieval.contact` moves frames to each
     other.
     """
 

@@ -14,8 +14,9 @@ from torch import Tensor
 from ...progress import Advance
 from ...scan import Exposures
 from .bounded import FIXED, Estimate, bounded_estimate
+from .contact import absorption_alone
 from .halo import without_halo
-from .linear import Linear, absorption_alone, contrast_transfer, invert_contrast, paganin, retrieve_thickness
+from .linear import Linear, contrast_transfer, invert_contrast, paganin, retrieve_thickness
 from .nonlinear import ADMM, Projections, Tikhonov, admm, gerchberg_saxton, hybrid_input_output, tikhonov
 from .spectra import Prior
 

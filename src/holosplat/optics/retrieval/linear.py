@@ -1,33 +1,21 @@
-"""Phase retrieval in one step: by a filter, Paganin's and the contrast transfer function of one material; or by
-absorption alone, of frames taken in contact, or so close behind the matter that no fringe is seen.
-
-Behind matter of thickness T the intensity is then `exp(-2 k β T)` (docs/conventions.md), and nothing in it depends on
-δ. What every method of retrieval returns there is the logarithm, with no prior: tomography weighs the noise.
-"""
+"""Phase retrieval in one step, by a filter: Paganin's, and the contrast transfer function of one material."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import replace
-from functools import partial, wraps
-from typing import Any, TypeVar, cast
 
 import numpy as np
-import scipy.ndimage as ndimage
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate, pad
+from torch.nn.functional import pad
 
 from ...checks import require
 from ...progress import Advance
 from ...ranges import checked_dataclass
 from ...scan import Exposures
 from ...units import wavelength, wavenumber
-from ..hologram import hologram, optical_path
-from ..noise import noise_levels, with_gaps
-from ..sampling import SharedPoses, alike, fringe_sampling, padding
 from .bounded import completed
+from .contact import or_in_contact
 from .spectra import (
     Noise,
     Prior,
@@ -38,179 +26,12 @@ from .spectra import (
     column,
     detector_transfer,
     filtered,
-    finest_phase,
     fresnel_phase,
     radian,
     response,
     spectra,
     surrounded,
 )
-
-UNSEEN = 0.01
-"""Refraction that changes the contrast of the finest detail by less than this share of its absorption is not seen."""
-LEAST_INTENSITY = 1e-6
-"""Intensity taken for the darkest pixel's, where frames have no noise that would set it."""
-FINEST = 4
-"""Times the samples of fits by which the frames of steep walls are known."""
-DARKEST = 1e-3
-"""Least intensity behind a wall that frames are divided by."""
-
-
-def _apart_px(exposures: Exposures, poses: SharedPoses) -> np.ndarray:
-    """How far each frame [V] lies beside the first one of its projection along rows and columns [pixels]."""
-    shifts = exposures.views.shifts[:, ::-1] / exposures.views.pixel_size
-    _, first = np.unique(poses.of, return_index=True)
-    apart = shifts - shifts[first[poses.of]]
-    return np.where(np.abs(apart) > np.finfo(np.float32).eps * max(exposures.views.shape), apart, 0.0)
-
-
-def _moved(images: Tensor, pixels: np.ndarray, beyond: float | None = None) -> Tensor:
-    """Images [V, H, W] on rasters that lie `pixels` [V, 2] further along rows and columns, by cubic splines; beyond:
-    the value outside (default: that of the edge)."""
-    found = images.clone()
-    mode, value = ("nearest", 0.0) if beyond is None else ("constant", beyond)
-    for n in np.flatnonzero(pixels.any(axis=1)):
-        order = 3 if beyond is None else 1
-        image = ndimage.shift(images[n].double().cpu().numpy(), -pixels[n], order=order, mode=mode, cval=value)
-        found[n] = torch.from_numpy(image).to(images)
-    return found
-
-
-Method = TypeVar("Method", bound=Callable[..., Tensor])
-
-
-def absorption_alone(exposures: Exposures, ratio: float) -> np.ndarray:
-    """[V] bool: views in which refraction is not seen beside absorption, for matter with β/δ = `ratio`.
-
-    A thin object's response is `2 (β/δ cos χ + sin χ)` (`spectra`): without fringes where χ stays far below |β|/δ.
-    """
-    delta, beta = exposures.refraction(1.0, ratio)
-    return finest_phase(exposures) <= UNSEEN * np.abs(beta) / delta
-
-
-def contact_thickness(
-    frames: Tensor, exposures: Exposures, delta: float, beta: float, missing: Tensor | None = None
-) -> Tensor:
-    """Thickness [V, H, W] in metres, `-ln I / 2kβ`, of matter with β ≠ 0 from frames [V, H, W] of absorption alone.
-
-    Errors: `InputError` for matter that does not absorb.
-    """
-    require(
-        beta != 0,
-        "frames in contact (distance 0) show absorption alone, but the material has β = 0; give one that absorbs, or "
-        "frames taken at a distance.",
-    )
-    mu = column(2 * wavenumber(exposures.energy_kev) * exposures.refraction(delta, beta)[1])
-    one_photon = noise_levels(with_gaps(frames, missing))[
-        :, None, None
-    ].square()  # variance σ² of relative frames: a photon counts σ²
-    least = one_photon.clamp_min(LEAST_INTENSITY).to(frames.device)
-    return (-torch.log(torch.maximum(frames.double(), least)) / mu.to(frames.device)).to(frames.dtype)
-
-
-ROUNDS = 3
-"""How often the frames beside a wall are made anew for a retrieval: first with no matter, then with what was found."""
-
-
-def seen(exposures: Exposures, thickness: Tensor, material: tuple[float, float], s: int) -> Tensor:
-    """Frames [V, H, W] of a thickness [V, H, W] [m] of `material` (δ, β), which goes on beyond as at the edge, and of
-    the wall of the exposures, if any; s: wave samples along a pixel's edge."""
-    found = torch.empty_like(thickness)
-    for index in alike(exposures, s):
-        part = exposures[index]
-        (my, mx), optical = padding(part, s), part.optical
-        wide = pad(thickness[index][:, None], (mx, mx, my, my), mode="replicate")
-        fine = interpolate(wide, scale_factor=s, mode="bilinear", align_corners=False)[:, 0]
-        units = [wavenumber(part.energy_kev) * share for share in part.refraction(1.0, 1.0)[::-1]]
-        lines = [fine * material[1], fine * material[0]]
-        if part.wall is not None:
-            known = part.wall.behind(part.views.padded((my, mx)).refined(s), *units)
-            lines = [mine + other.to(fine) for mine, other in zip(lines, known)]
-        B, D = (line * column(unit).to(fine) for line, unit in zip(lines, units))
-        frame = (part.views.shape, (my * s, mx * s), s)
-        blurs, pitch = optical.psf_sigma_px * s, optical.views.pitch / s
-        path = optical_path(
-            (fine.shape[1], fine.shape[2]), pitch, part.energy_kev, optical.distance, blurs, frame, fine.dtype
-        )
-        found[index] = hologram(torch.stack((D, B), 1), [(1.0, 0.0), (0.0, 1.0)], path, "reference")
-    return found
-
-
-def beside_faces(exposures: Exposures, few: Tensor) -> Tensor:
-    """What frames `few` [V, H, W] of a wall alone lack, [V, H, W]: those of `FINEST` times finer samples less them.
-
-    At flat faces along the beam waves have no end of high frequencies, and samples that hold those of what is inside
-    lack them; what they miss of the wall's own frame is the most of it.
-    """
-    views = exposures.views
-    rows = 1 if views.shares_axis else views.shape[0]
-    exposures = replace(exposures, views=replace(views, shape=(rows, views.shape[1])))
-    nothing = few.new_zeros((len(views), rows, views.shape[1]), device="cpu")
-    return seen(exposures, nothing, (1.0, 0.0), FINEST * fringe_sampling(exposures)).to(few) - few
-
-
-def without_wall(
-    method: Callable[[Tensor, Exposures], Tensor], frames: Tensor, exposures: Exposures, material: tuple[float, float]
-) -> Tensor:
-    """What `method` retrieves of `material` (δ, β) from frames [V, H, W] beside a known wall (`Exposures.wall`).
-
-    It is given the frames times `I(T) / I(T + wall)`, T being the thickness that it found before, so that all that the
-    model does not explain stays in them. With no matter they are the frames over those of the wall.
-    """
-    alone = replace(exposures, wall=None)
-    found, s = torch.zeros_like(frames), fringe_sampling(exposures)
-    more = beside_faces(exposures, seen(exposures, found.cpu(), material, s)).to(frames)
-    for _ in range(ROUNDS):
-        without, within = (seen(which, found.cpu(), material, s).to(frames) for which in (alone, exposures))
-        found = method(frames * without / (within + more).clamp_min(DARKEST), alone)
-    return found
-
-
-def or_in_contact(method: Method) -> Method:
-    """`method` for the views that show refraction, and `contact_thickness` for those that show absorption alone; beside
-    a wall that is known, for frames as if without it (`without_wall`)."""
-
-    @wraps(method)
-    def retrieve(
-        frames: Tensor,
-        exposures: Exposures,
-        delta: float,
-        beta: float,
-        *,
-        missing: Tensor | None = None,
-        **options: Any,
-    ) -> Tensor:
-        if exposures.wall is not None:
-            alone = partial(retrieve, delta=delta, beta=beta, missing=missing, **options)
-            return without_wall(alone, frames, exposures, (delta, beta))
-        exposures = exposures.optical
-        checked(frames, exposures, delta)
-        poses = SharedPoses(exposures)
-        alone = absorption_alone(exposures, beta / delta)
-        if poses.any:  # beside frames at a distance, those in contact have their part in the waves
-            alone = poses.mean(torch.from_numpy(alone).double()).numpy() == 1
-        apart = _apart_px(exposures, poses)
-        if apart.any():
-            gaps = torch.zeros(frames.shape, dtype=torch.bool) if missing is None else missing
-            frames, missing = _moved(frames, -apart), _moved(gaps.double(), -apart, beyond=1.0) > 0
-            views = replace(
-                exposures.views, shifts=exposures.views.shifts - apart[:, ::-1] * exposures.views.pixel_size
-            )
-            there = retrieve(frames, replace(exposures, views=views), delta, beta, missing=missing, **options)
-            return _moved(there, apart)
-        if not alone.any():
-            return method(frames, exposures, delta, beta, missing=missing, **options)
-        found = torch.empty_like(frames)
-        found[alone] = contact_thickness(
-            frames[alone], exposures[alone], delta, beta, missing if missing is None else missing[alone]
-        )
-        if not alone.all():
-            some = None if missing is None else missing[~alone]
-            found[~alone] = method(frames[~alone], exposures[~alone], delta, beta, missing=some, **options)
-        return found
-
-    return cast(Method, retrieve)
-
 
 WEAKEST_ABSORPTION = 1e-4
 """|β|/δ assumed at least: it sets the lowest frequencies that retrieval trusts."""

@@ -16,7 +16,7 @@ from ...progress import Advance
 from ...ranges import Weight, checked_dataclass
 from ...scan import Exposures
 from ..propagation import exit_wave_of
-from .linear import or_in_contact
+from .contact import or_in_contact
 from .model import DARKEST, Projections, Regularised, WaveModel, view_by_view
 from .spectra import TINY, squared_frequency
 
