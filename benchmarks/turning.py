@@ -3,10 +3,10 @@
     python benchmarks/turning.py            # ten minutes on one core; rows that are there are not made again
 
 Cells of water at 20 keV and 0.05 m, on pixels of 1 µm, with 3000 photons a pixel: `helix` has 48 frames of 40 rows over
-540 degrees, in which the object moves by 60 rows, beside a planar scan of 19 views of 100 rows, which is as many photons;
-`laminography` has 24 views of 48 × 64 pixels about an axis that leans by 30 degrees, beside one that does not. Errors of
-the helix are of the 60 rows that half a turn sees. `aligned_px` is what is left of random shifts of one pixel (rms) after
-`align`, with 20,000 photons, without what moves the object; lost views, more than 2 pixels off, count in `lost`.
+540 degrees, in which the object moves by 60 rows, beside a planar scan of 19 views of 100 rows, as many photons in all;
+`laminography` has 24 views of 48 × 64 pixels about an axis that leans by 30 degrees, beside one that does not. Errors
+of the helix are of the 60 rows that half a turn sees. `aligned_px` is what is left of random shifts of one pixel (rms)
+after `align`, with 20,000 photons, without what moves the object; lost views, more than 2 pixels off, count in `lost`.
 Meshes are simulated exactly, which no reconstruction does.
 """
 

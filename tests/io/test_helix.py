@@ -116,7 +116,11 @@ def test_a_helix_is_reconstructed_in_all_rows_that_it_sees(scene):
     turning = replace(turning, shifts=turning.shifts - turning.shifts.mean(0))
     for name, views in {"planar": Views.evenly_spaced(14, (46, 24), PIXEL), "helix": turning, "low": turning}.items():
         scan = hs.simulate(
-            scene, Exposures.of(views, 20.0, 0.02), photons_per_pixel=2e4, seed=1, is_test=[False] * len(views)
+            scene,
+            Exposures.of(views, 20.0, 0.02),
+            photons_per_pixel=2e4,
+            seed=1,
+            is_test=np.zeros(len(views), dtype=bool),
         )
         found = hs.reconstruct(
             scan if name == "low" else heightened(scan), hs.MaterialPrior.known(WATER), hs.Surfaces().with_effort(0.3)
@@ -129,7 +133,7 @@ def test_a_file_is_read_as_taller_frames_and_aligned_as_its_own(tmp_path: Path, 
     views = helix(20, (24, 24), 25.0, turns=1.2)
     away = PIXEL * np.random.default_rng(3).normal(size=(20, 2))
     moved = replace(views, shifts=views.shifts + away)
-    scan = hs.simulate(scene, Exposures.of(moved, 20.0, 0.02), is_test=[False] * 20)
+    scan = hs.simulate(scene, Exposures.of(moved, 20.0, 0.02), is_test=np.zeros(20, dtype=bool))
     write_scan(tmp_path / "helix.nxs", scan.taken(replace(scan.exposures, views=views)))
     assert read_as(tmp_path / "helix.nxs", Reading()).views.shape == (24 + 25, 24)
     done = holosplat(
