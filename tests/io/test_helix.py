@@ -52,6 +52,7 @@ def test_frames_are_parts_of_taller_ones_at_their_place(scene):
     tall = heightened(scan)
     assert tall.views.shape == (15 + 23, 22)
     assert np.abs(tall.views.shifts[:, 1] - tall.views.shifts[:, 1].mean()).max() <= PIXEL
+    assert tall.missing is not None
     first = [int(np.flatnonzero(~gaps.all(1))[0]) for gaps in tall.missing]
     assert first[0] == 0
     assert first[-1] == 23
@@ -101,6 +102,7 @@ def test_phase_retrieval_takes_rows_without_values_for_a_smaller_frame(method, s
     tall = heightened(scan)
     alone = method(torch.from_numpy(scan.frames), scan.exposures, *WATER)
     found = method(torch.from_numpy(tall.frames), tall.exposures, *WATER, missing=tall.gaps)
+    assert tall.missing is not None
     for v, gaps in enumerate(tall.missing):
         first, last = np.flatnonzero(~gaps.all(1))[[0, -1]]
         part = found[v, first : last + 1]
