@@ -150,9 +150,9 @@ def _bands(missing: Tensor | None, rows: int) -> np.ndarray:
     without any, all."""
     if missing is None:
         return np.array([[0, rows]])
-    known: np.ndarray = (~missing).any(2).cpu().numpy()
+    known = (~missing).any(2).cpu().numpy()
     bands = np.stack([known.argmax(1), rows - known[:, ::-1].argmax(1)], 1)
-    return np.where(known.any(1)[:, None], bands, [0, rows])
+    return np.where(known.any(1, keepdims=True), bands, [0, rows])
 
 
 def _in_bands(
