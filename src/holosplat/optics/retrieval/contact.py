@@ -198,11 +198,9 @@ def or_in_contact(method: Method) -> Method:
             return without_wall(alone, frames, exposures, (delta, beta))
         exposures = exposures.optical
         checked(frames, exposures, delta)
-        bands = _bands(missing, frames.shape[1])
-        if (bands[:, 1] - bands[:, 0] < frames.shape[1]).any():
-            assert missing is not None
+        poses, bands = SharedPoses(exposures), _bands(missing, frames.shape[1])
+        if missing is not None and not poses.any and (bands[:, 1] - bands[:, 0] < frames.shape[1]).any():
             return _in_bands(partial(retrieve, delta=delta, beta=beta, **options), frames, exposures, missing, bands)
-        poses = SharedPoses(exposures)
         alone = absorption_alone(exposures, beta / delta)
         if poses.any:  # beside frames at a distance, those in contact have their part in the waves
             alone = poses.mean(torch.from_numpy(alone).double()).numpy() == 1
