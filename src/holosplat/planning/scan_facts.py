@@ -127,10 +127,11 @@ def evenly(numbers: np.ndarray, most: int) -> np.ndarray:
 def _facts(path: Path, reading: Reading, loader: Loader, opened: Opened, unsaid: Unsaid) -> ScanFacts:
     scan, file = reading.applied(opened[0]), opened[1]
     numbers = evenly(np.arange(len(scan)), LOOKED)
-    look = looked(np.asarray(scan.source[numbers]))
+    own = reading.applied(opened[0], joined=False) if "heightened" in scan.provenance else scan
+    look = looked(np.asarray(own.source[numbers]))
     rows = {"what": f"a scan: {loader.mark} ({loader.name})"} | keys_of(path) | _frames(scan, file)
     rows |= _beam(scan.exposures, unsaid) | _angles(scan, file, unsaid)
-    likeness = None if "angles_deg" in unsaid else opposite_likeness(scan.views[numbers], look.frames)
+    likeness = None if "angles_deg" in unsaid else opposite_likeness(own.views[numbers], look.frames)
     if likeness is not None:
         rows["half a turn on"] = (
             f"frames are mirrored about this axis: correlation {likeness:.2f} (1 where it is right)"
@@ -231,7 +232,9 @@ def opposite_likeness(views: Views, frames: np.ndarray) -> float | None:
     if angles is None or not views.has_one_pixel:
         return None
     pairs = combinations(range(len(angles)), 2)
-    pair = next((p for p in pairs if abs((angles[p[1]] - angles[p[0]]) % 360 - 180) < SAME_DEG), None)
+    rows = views.shifts[:, 1] / views.pixel_size
+    level = (p for p in pairs if round(rows[p[1]] - rows[p[0]]) == 0)
+    pair = next((p for p in level if abs((angles[p[1]] - angles[p[0]]) % 360 - 180) < SAME_DEG), None)
     if pair is None:
         return None
     columns = np.arange(views.shape[1])
