@@ -1,12 +1,14 @@
 """On which side of its medium's the δ of matter lies: bodies in air or in a lighter medium, or holes in a denser one.
 
 The null is matter above its medium. Holes are taken where a volume of them predicts unseen frames better; matter on
-both sides, such as a shock and what is rarefied behind it, where this predicts them better than either.
+both sides, such as a shock and what is rarefied behind it, where this predicts them better than either. Few views leave
+so much of a volume on both sides open that it predicts others worse than one that is bound to a side, even where that
+side is wrong; the few unknowns of spherical matter they do tell.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import torch
@@ -16,12 +18,13 @@ from ..checks import InputError
 from ..inference import Decision, Score, select
 from ..matter import MaterialPrior
 from ..optics.background import LightOptions
-from .first_volumes import FirstVolumes
+from .first_volumes import BY_FISSION, FirstVolumes
 from .trials import WITHOUT, Hypothesis, Trials, name_of
 
 STAGE = "sign of the contrast"
 ABOVE, BELOW = "δ above the medium's", "δ below the medium's"
 BOTH = "δ on both sides of the medium's"
+SPHERICAL = f"spherical matter, {BOTH}"
 
 
 Scoring = Callable[[FirstVolumes, int, str], Score]
@@ -60,19 +63,22 @@ def decide_sign(first: FirstVolumes, *scores: Scoring) -> tuple[FirstVolumes, tu
 
 
 def decide_sides(first: FirstVolumes, light: LightOptions, told: Hypothesis = ()) -> tuple[FirstVolumes, Decision]:
-    """The first volumes of matter on one side of its medium, or on both, and the decision between them.
+    """The first volumes of matter on one side of its medium, or on both, perhaps spherical, and the decision.
 
     Light makes up for matter that may not be there, and both sides for light. So both sides must predict unseen frames
     better than one, under the light that is `told` alone, and no worse than one in the light that was taken beside it:
-    where these are alike, the frames are left alone.
+    where these are alike, the frames are left alone. Spherical matter, which has the fewest unknowns, is asked for
+    before any on both sides; what predicts unseen views by its few unknowns may yet leave much of those that it was
+    fitted to, so it is refuted where other matter predicts the same views better, their noise apart (data fission).
     """
     first.on_progress(STAGE, 0.0)
     one = ABOVE if first.prior.delta_sign > 0 else BELOW
     two = both_sides(first)
     lit, single = f"{one} in {name_of(first.taken)}", Trials(first, light)
-    trials = {one: (single, told), BOTH: (Trials(two, light), told)}
+    spheres = replace(two, prior=two.prior.about_a_point(), _made={})
+    trials = {one: (single, told), SPHERICAL: (Trials(spheres, light), told), BOTH: (Trials(two, light), told)}
     if first.taken != told:
-        trials[lit] = single, first.taken
+        trials = {one: trials[one], lit: (single, first.taken)} | trials
 
     def scored(name: str, fold: int) -> Score:
         side, without, _ = name.partition(WITHOUT)
@@ -82,11 +88,30 @@ def decide_sides(first: FirstVolumes, light: LightOptions, told: Hypothesis = ()
         except InputError:  # there is no such matter
             return _without_matter(first, fold)
 
-    beside, by = {BOTH: (BOTH + WITHOUT,)}, first.folds.by
+    beside, by = {name: (name + WITHOUT,) for name in (SPHERICAL, BOTH)}, first.folds.by
     decision = select(STAGE, tuple(trials), scored, first.folds.count, by=by, beside=beside)
-    if decision.choice == BOTH:
-        return two, decision
-    return first, replace(decision, choice=one)
+    if decision.choice == SPHERICAL and _refuted({SPHERICAL: spheres, one: first, BOTH: two}, light, told):
+        del trials[SPHERICAL]
+        decision = select(STAGE, tuple(trials), scored, first.folds.count, by=by, beside=beside)
+    found = {SPHERICAL: spheres, BOTH: two}.get(decision.choice)
+    return (found, decision) if found else (first, replace(decision, choice=one))
+
+
+def _refuted(volumes: Mapping[str, FirstVolumes], light: LightOptions, told: Hypothesis) -> bool:
+    """Whether other volumes than the first ones predict the same views with other noise better."""
+    tried = {}
+    for name, one in volumes.items():
+        halves = replace(one, folds=replace(one.folds, count=1, by=BY_FISSION), _made={})
+        tried[name] = Trials(halves, light)
+
+    def scored(name: str, fold: int) -> Score:
+        try:
+            return tried[name].score(name_of(told), fold)
+        except InputError:  # there is no such matter
+            return _without_matter(next(iter(volumes.values())), fold)
+
+    null = next(iter(volumes))
+    return select(STAGE, tuple(volumes), scored, by=BY_FISSION).choice != null
 
 
 def both_sides(first: FirstVolumes) -> FirstVolumes:
@@ -105,6 +130,6 @@ def with_sign(prior: MaterialPrior, decisions: Sequence[Decision]) -> MaterialPr
     """`prior` with the sign, or both, that was decided for last, if any was."""
     for each in decisions:
         if each.name == STAGE:
-            both = each.choice == BOTH
-            prior = prior.on_both_sides() if both else prior.signed(-1 if each.choice == BELOW else 1)
+            sides = {BOTH: prior.on_both_sides, SPHERICAL: prior.about_a_point}.get(each.choice)
+            prior = sides() if sides else prior.signed(-1 if each.choice == BELOW else 1)
     return prior

@@ -18,6 +18,7 @@ from ..backends import resolve
 from ..baselines import HolographicTV, holographic_tv
 from ..baselines.algebraic import Algebraic, sirt
 from ..baselines.holographic_tv import retrieved
+from ..fit.whitened import WhitenedFrames
 from ..geometry import Grid
 from ..matter import DeltaBeta, KnownRatio, MaterialPrior, Matter
 from ..optics.background import Background, Light
@@ -29,6 +30,7 @@ from ..scan import Scan
 from ..volume import Object
 from .assumed import assumed_material
 from .cross_validation import predicted_frames
+from .spherical import likeliest_sphere
 
 PICTURE_WIDTH, PICTURE_VIEWS = 48, 32
 """Frames of a first picture are binned to about so many pixels, and it takes so many of them at most: on one core it is
@@ -167,6 +169,8 @@ class FirstVolumes:
         if plain and self.folds.by == BY_VIEWS:
             lines = self.once("thickness", 0, self._thickness)[self.folds.kept(fold)]
         values, grid = holographic_tv(even, self.material, self._how, self.on_progress, light, lines=lines)
+        if self.prior.spherical:
+            values = likeliest_sphere(WhitenedFrames(even, self.material, light.noise), values)
         return VoxelGrid(values[None], grid, Matter.one(*self.material)).on(resolve(self.options.backend))
 
     def _thickness(self) -> Tensor:

@@ -24,6 +24,7 @@ from ..representations import VoxelGrid
 from ..scan import Scan
 from .assumed import assumed_material
 from .auto import Auto
+from .continued import Continued
 from .contrast import STAGE as SIGN
 from .contrast import Scoring, decide_sides, decide_sign, with_sign
 from .cross_validation import predicted_frames
@@ -177,9 +178,10 @@ def prepared(task: Task, method: Method | None = None, before: Prepared | None =
 
 
 def _may_have_both_sides(task: Task, method: Method | None, first: FirstVolumes) -> bool:
-    """Whether matter may be on both sides of its medium: a known material is on one; and whether views can tell."""
+    """Whether matter may be on both sides of its medium: a known material is on one; and whether views can tell. Where
+    a method goes on from a run, that has decided."""
     told = bool(task.prior.materials) or task.prior.two_sided
-    can = method is not None and method.two_sided and not task.scan.is_series
+    can = method is not None and method.two_sided and not (task.scan.is_series or isinstance(method, Continued))
     return can and not told and first.folds.by != BY_FISSION
 
 

@@ -23,6 +23,7 @@ from .assumed import assumed_material
 from .cross_validation import predicted_frames
 from .method import Method, Stage, Task
 from .smooth_fit import SmoothFit, SmoothPlan
+from .spherical import SphericalFit
 
 LEFT = 0.1
 """Part of the contrast that counts as noise at least where matter leaves the frames: what is beyond explains too much.
@@ -110,7 +111,7 @@ class SmoothStage:
         field = scan.views.padded(margins_of(grid, scan.views))
         return VoxelGrid(first[None], grid, Matter.one(*material)).resampled(Grid.of_views(field))
 
-    def fit(self, task: Task, start: Stored) -> SmoothFit:
+    def fit(self, task: Task, start: Stored) -> SmoothFit | SphericalFit:
         """The fit to the training frames, from larger voxels on."""
         assert isinstance(start, VoxelGrid)
         options, factor = self.options, binning(task.scan, self.options.max_voxels)
@@ -126,7 +127,8 @@ class SmoothStage:
         how = (prior, options.coarser, options.rounds, options.iterations, faint, options.loose)
         # one density as a level lost 4 % of the total of balls at 500 photons a pixel, and gained nothing
         known = task.prior.materials if len(task.prior.materials) > 1 else ()
-        return SmoothFit(SmoothPlan(scan, start, noise, task.prior.fixes_ratio, light, *how, backend, known))
+        plan = SmoothPlan(scan, start, noise, task.prior.fixes_ratio, light, *how, backend, known)
+        return SphericalFit(plan.frames(1), start, backend) if task.prior.spherical else SmoothFit(plan)
 
 
 def _beside(task: Task, start: VoxelGrid) -> Scan:

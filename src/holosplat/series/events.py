@@ -300,17 +300,18 @@ class Front:
 
 
 def _jump(places: np.ndarray, values: np.ndarray) -> float:
-    """Radius at which the radial mean of values about the middle of `places` [N, 3] jumps by most, in units of the
-    scatter of all that is farther out: a front runs into what is even."""
+    """Radius at which the radial mean of values about the middle of `places` [N, 3] jumps: the squares that the jump
+    explains in the two rings behind it, less those of all rings farther out about their mean, are most. A front runs
+    into what is even."""
     ring = np.linalg.norm(places, axis=1).astype(int)
     last = max(5, int(np.abs(places).max()))  # beyond it directions are missing
-    count, total, square = (np.bincount(ring, weight, last + 1)[: last + 1] for weight in (None, values, values**2))
+    count, total = (np.bincount(ring, weight, last + 1)[: last + 1] for weight in (None, values))
     mean = total / np.maximum(count, 1)
-    far = [np.cumsum(part[::-1])[::-1] for part in (count, total, square)]
-    scatter = np.sqrt(np.maximum(far[2] / far[0] - (far[1] / far[0]) ** 2, 1e-12))
-    radii = np.arange(2, last - 1)
+    far = [np.cumsum(part[::-1])[::-1] for part in (count, total, count * mean**2)]
+    uneven, radii = far[2] - far[1] ** 2 / far[0], np.arange(2, last - 1)
     inside, beyond = (np.array([mean[r + a : r + a + 2].mean() for r in radii]) for a in (-2, 1))
-    return float(radii[(np.abs(inside - beyond) * radii / scatter[radii + 1]).argmax()])
+    behind = count[radii - 2] + count[radii - 1]
+    return float(radii[(behind * (inside - beyond) ** 2 - uneven[radii + 1]).argmax()])
 
 
 def _fitted(places: np.ndarray, values: np.ndarray, start: np.ndarray) -> np.ndarray:

@@ -1,0 +1,191 @@
+"""Continuous matter that is spherical, as a shock from a point: its likeliest profile over the radius, and centre."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from ..backends import resolve
+from ..fit.run import Record, interrupts_held
+from ..fit.smooth_volume import ContinuousPrior, VolumeProblem
+from ..fit.whitened import WhitenedFrames
+from ..memory import memory_kept
+from ..model import Instrument, Model
+from ..representations import VoxelGrid
+
+AXES = 3
+DAMPED, EASED, MOST_DAMPED = 1e-3, 10.0, 1e6
+"""Damping at first, as a share of each second derivative; the factor by which it falls after a step that helped and
+grows after one that did not; and the one at which the fit ends, for then no step helps."""
+WORTH = 0.5
+"""Gain of the log-likelihood below which a step is the last: by so much one of the unknowns moves it on average."""
+MOST = 30
+"""Steps at most; Gauss and Newton's take about eight."""
+
+
+class Sphere:
+    """The likeliest spherical volume, by Gauss and Newton's steps with damping (Levenberg 1944, Marquardt 1963).
+
+    Unknowns are the centre (z, y, x) in voxels and the values at the radii 0, 1, … voxels up to half the shorter side;
+    they are linear between, and 0 beyond. So few unknowns need no prior: hundreds of pixels tell each of them.
+
+    frames: in units of their noise; start [Z, Y, X]: a volume of them, whose means over spheres are where the fit
+    begins, about the point by whose reflection the frames change least (`_symmetric_about`).
+    """
+
+    def __init__(self, frames: WhitenedFrames, start: Tensor, backend: str = "cpu") -> None:
+        self.problem = VolumeProblem(frames, ContinuousPrior(two_sided=True), 1.0, backend)
+        axes = [torch.arange(n, dtype=torch.float64) for n in start.shape]
+        self._places = torch.stack(torch.meshgrid(*axes, indexing="ij"))
+        rows, columns = frames.beyond
+        contrast = pad(frames.known(frames.measured - 1), (columns, columns, rows, rows))
+        count, centre = min(start.shape) // 2, _symmetric_about(self.problem.backprojection(contrast).cpu())
+        near = (self._places - centre[:, None, None, None]).norm(dim=0).round().long().clamp_max(count).flatten()
+        sums, members = (torch.zeros(count + 1, dtype=torch.float64) for _ in range(2))
+        sums.index_add_(0, near, start.double().cpu().flatten())
+        members.index_add_(0, near, torch.ones_like(near, dtype=torch.float64))
+        self.unknowns = torch.cat([centre, (sums / members.clamp_min(1))[:count]])
+        self.value, self.damping, self.done, self.ended = self._value(self.unknowns), DAMPED, 0, False
+
+    def volume(self, unknowns: Tensor | None = None) -> Tensor:
+        """The volume [Z, Y, X]."""
+        unknowns = self.unknowns if unknowns is None else unknowns
+        _, shell, part = self._shells(unknowns)
+        values = torch.cat([unknowns[AXES:], unknowns.new_zeros(2)])
+        return torch.lerp(values[shell], values[shell + 1], part).float()
+
+    def step(self) -> None:
+        """One step, if any helps."""
+        lines, changes = (
+            self.problem.lines(self._there(self.volume())),
+            [self.problem.lines(self._there(change)) for change in self._changes()],
+        )
+        matrix, missing = self.problem.frames.normal_equations(lines, changes)
+        diagonal = torch.diag(matrix.diag().clamp_min(1e-12 * float(matrix.diag().max())))
+        while self.damping < MOST_DAMPED:
+            tried = self.unknowns + torch.linalg.solve(matrix + self.damping * diagonal, missing).cpu()
+            value = self._value(tried)
+            if value < self.value:
+                self.ended = self.value - value < WORTH or self.done + 1 >= MOST
+                self.unknowns, self.value, self.done = tried, value, self.done + 1
+                self.damping /= EASED
+                return
+            self.damping *= EASED
+        self.ended = True
+
+    def _shells(self, unknowns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Radii [Z, Y, X], the last of the unknown radii below each, and how far beyond it they are."""
+        radius = (self._places - unknowns[:AXES, None, None, None]).norm(dim=0)
+        shell = radius.long().clamp_max(len(unknowns) - AXES)
+        return radius, shell, (radius - shell).clamp_max(1.0)
+
+    def _changes(self) -> list[Tensor]:
+        """Derivatives [Z, Y, X] of the volume by the unknowns."""
+        radius, shell, part = self._shells(self.unknowns)
+        values = torch.cat([self.unknowns[AXES:], self.unknowns.new_zeros(2)])
+        slope = (values[shell + 1] - values[shell]) / radius.clamp_min(0.5)
+        moved = [(slope * (centre - place)).float() for centre, place in zip(self.unknowns, self._places)]
+        hats = [((shell == n) * (1 - part) + (shell == n - 1) * part).float() for n in range(len(values) - 2)]
+        return [*moved, *hats]
+
+    def _value(self, unknowns: Tensor) -> float:
+        return self.problem.frames(self.problem.lines(self._there(self.volume(unknowns)))).value
+
+    def _there(self, volume: Tensor) -> Tensor:
+        return volume.to(self.problem.device)
+
+
+def _symmetric_about(volume: Tensor) -> Tensor:
+    """The point (z, y, x), in half voxels, about which a volume is most nearly its own reflection: half of where its
+    convolution with itself is largest. What few views smear of a sphere is as symmetric as the sphere, and so are its
+    fringes, which noise hides less than what is retrieved of them."""
+    twice = [2 * n for n in volume.shape]
+    convolved = torch.fft.irfftn(torch.fft.rfftn(volume, s=twice).square(), s=twice)
+    index = np.unravel_index(int(convolved.argmax()), convolved.shape)
+    return 0.5 * torch.tensor([float(n) for n in index], dtype=torch.float64)
+
+
+def likeliest_sphere(frames: WhitenedFrames, start: Tensor) -> Tensor:
+    """The spherical volume [Z, Y, X] at which a `Sphere` ends."""
+    sphere = Sphere(frames, start)
+    while not sphere.ended:
+        sphere.step()
+    return sphere.volume().to(start)
+
+
+class SphericalFit:
+    """A spherical volume in progress, as a run asks of every fit (`fit.run`). begun: what it starts from."""
+
+    aside = 0
+    stopped_early = False
+    best_step = 0
+
+    def __init__(self, frames: WhitenedFrames, begun: VoxelGrid, backend: str) -> None:
+        self.backend, self.seconds, self._begun = resolve(backend), 0.0, begun
+        self._sphere = Sphere(frames, begun.values[0], self.backend)
+
+    @property
+    def step(self) -> int:
+        """Steps that are done."""
+        return self._sphere.done
+
+    @property
+    def oversample(self) -> int:
+        """Wave samples a pixel."""
+        return self._sphere.problem.frames.instrument.oversample
+
+    @property
+    def finished(self) -> bool:
+        """Whether no step helps any more."""
+        return self._sphere.ended
+
+    @property
+    def share(self) -> float:
+        """How much of the work is done."""
+        return 1.0 if self.finished else self.step / MOST
+
+    def result(self) -> Model:
+        """The model of the volume as it is now."""
+        found = self._begun.with_parameters({"values": self._sphere.volume()[None]})
+        exposures = self._sphere.problem.frames.train.exposures
+        return Model(found, Instrument(exposures, self.oversample, backend=self.backend))
+
+    def resolved(self) -> dict[str, Any]:
+        """What the options have become."""
+        return {"radii": len(self._sphere.unknowns) - AXES}
+
+    def columns(self) -> list[str]:
+        """Names of what a record holds."""
+        return ["step", "seconds", "loss"]
+
+    def run(self, on_record: Callable[[Record], None], until: int | None = None) -> None:
+        """Advance to the end (or to step `until`), with one record a step; Ctrl-C is passed on between two."""
+        with memory_kept(), interrupts_held() as release:
+            while not self.finished and (until is None or self.step < until):
+                started = time.perf_counter()
+                self._sphere.step()
+                self.seconds += time.perf_counter() - started
+                on_record({"step": self.step, "loss": self._sphere.value, "seconds": self.seconds})
+                release()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that `load` needs to go on as if nothing had happened."""
+        sphere = self._sphere
+        numbers = {"value": sphere.value, "damping": sphere.damping, "done": sphere.done, "ended": sphere.ended}
+        return {"unknowns": sphere.unknowns, "seconds": self.seconds, **numbers}
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Go back to a saved state."""
+        sphere, self.seconds = self._sphere, float(state["seconds"])
+        sphere.unknowns, sphere.value, sphere.damping = (
+            state["unknowns"],
+            float(state["value"]),
+            float(state["damping"]),
+        )
+        sphere.done, sphere.ended = int(state["done"]), bool(state["ended"])
