@@ -177,7 +177,7 @@ class MaterialPrior:
     two_sided: bool = False
     """Whether δ of continuous matter may lie on both sides of its medium's."""
     spherical: bool = False
-    """Whether continuous matter on both sides is spherical about a point that is not known, as a shock from there."""
+    """Whether continuous matter is spherical about a point that is not known, as a shock from there."""
     medium: str = ""
     """Name of the medium, as it was given."""
 
@@ -224,9 +224,9 @@ class MaterialPrior:
         return replace(self, two_sided=True)  # type: ignore[type-var]  # every kind is a dataclass
 
     def about_a_point(self) -> MaterialPrior:
-        """The same knowledge of continuous matter on both sides of its medium that is spherical. Errors: those of
-        `on_both_sides`."""
-        return replace(self.on_both_sides(), spherical=True)  # type: ignore[type-var]
+        """The same knowledge of continuous matter that is spherical. Errors: `InputError` for several materials."""
+        require(len(self.materials) < 2, "spherical matter must be of one material, but there are several; give one.")
+        return replace(self, spherical=True)  # type: ignore[type-var]  # every kind is a dataclass
 
     def with_ratio(self, ratio: float) -> MaterialPrior:
         """What is known of one material whose δ/β was found."""

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import holosplat as hs
+from holosplat.checks import InputError
 from holosplat.fit.whitened import WhitenedFrames
 from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta, MaterialPrior
@@ -28,6 +29,7 @@ from holosplat.specimens.continuous import ContinuousScene, Soft, ellipsoid
 WATER = DeltaBeta(5.75e-7, 2.56e-10)
 PIXEL, SHAPE, PHOTONS = 1e-6, (37, 43), 3000.0
 VIEWS = Views.from_angles([0.0, 60.0, 120.0], SHAPE, PIXEL)
+SPHERE = MaterialPrior.of_ratio(WATER.ratio).on_both_sides().about_a_point()
 PLAIN = LightOptions("even", still="none", noise="white")
 
 
@@ -70,7 +72,7 @@ def test_steps_follow_the_derivatives_of_the_volume(scan):
 
 def test_a_shock_is_found_in_three_beams(scan, shock):
     """As voxels of any kind it is not: nine tenths of the field are free then."""
-    done = hs.reconstruct(scan, MaterialPrior.of_ratio(WATER.ratio).about_a_point(), SmoothVolume(), light=PLAIN)
+    done = hs.reconstruct(scan, SPHERE, SmoothVolume(), light=PLAIN)
     truth = shock.voxelise(Grid.of_views(VIEWS)).delta
     found = done.object.voxelise(Grid.of_views(VIEWS)).delta
     assert np.linalg.norm(found - truth) < 0.25 * np.linalg.norm(truth)
@@ -93,12 +95,12 @@ def test_spherical_matter_is_taken_where_it_predicts_unseen_frames(scan):
     assert again.prior == task.prior
 
 
-@pytest.mark.parametrize("flat", [1.0, 0.8])
-def test_matter_that_is_no_sphere_is_none(flat):
-    """Two soft holes, and one that is flattened by a fifth."""
+@pytest.mark.parametrize(("flat", "count"), [(1.0, 2), (0.8, 1), (1.0, 1)])
+def test_matter_that_is_no_sphere_or_on_one_side_is_left_alone(flat, count):
+    """Two soft holes, one that is flattened by a fifth, and one that is a sphere of one side."""
     first = ellipsoid(np.array([-2e-6, 1e-6, 3e-6]), (9e-6, 9e-6 * flat, 9e-6), Soft(0.3), DeltaBeta(-4e-7, -1.8e-10))
     other = ellipsoid(np.array([9e-6, -4e-6, -2e-6]), (5e-6,) * 3, Soft(0.3), DeltaBeta(-4e-7, -1.8e-10))
-    scene = ContinuousScene((first, other) if flat == 1 else (first,))
+    scene = ContinuousScene((first, other)[:count])
     holes = first_of_task(Task(of(scene), MaterialPrior.of_ratio(WATER.ratio).signed(-1)))
     found, decision = decide_sides(holes, PLAIN)
     assert decision.choice == BELOW
@@ -106,7 +108,7 @@ def test_matter_that_is_no_sphere_is_none(flat):
 
 
 def test_a_fit_goes_on_where_it_was(scan):
-    task = Task(scan, MaterialPrior.of_ratio(WATER.ratio).about_a_point(), matter="continuous", light=PLAIN)
+    task = Task(scan, SPHERE, matter="continuous", light=PLAIN)
     stage = SmoothStage(SmoothVolume())
     start = stage.start(task, None)
     whole, part, rest = (stage.fit(task, start) for _ in range(3))
@@ -122,9 +124,10 @@ def test_a_fit_goes_on_where_it_was(scan):
 
 def test_what_is_told_is_kept_in_files():
     for prior in (MaterialPrior.unknown(-1), MaterialPrior.of_ratio(900.0), MaterialPrior.known(WATER)):
-        told = prior.about_a_point()
-        assert told.two_sided
-        assert told.spherical
-        assert prior_of(told.as_dict()) == told
-        assert told.with_ratio(700.0).spherical
-    assert replace(told, spherical=False) == prior.on_both_sides()
+        for told in (prior.about_a_point(), prior.about_a_point().on_both_sides()):
+            assert told.spherical
+            assert prior_of(told.as_dict()) == told
+            assert told.with_ratio(700.0).spherical
+        assert replace(told, spherical=False) == prior.on_both_sides()
+    with pytest.raises(InputError, match="must be of one material"):
+        MaterialPrior.known(WATER, DeltaBeta(1e-7, 1e-10)).about_a_point()

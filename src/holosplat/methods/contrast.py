@@ -24,7 +24,7 @@ from .trials import WITHOUT, Hypothesis, Trials, name_of
 STAGE = "sign of the contrast"
 ABOVE, BELOW = "δ above the medium's", "δ below the medium's"
 BOTH = "δ on both sides of the medium's"
-SPHERICAL = f"spherical matter, {BOTH}"
+SPHERICAL, BALL = f"spherical matter, {BOTH}", "spherical matter on one side of the medium"
 
 
 Scoring = Callable[[FirstVolumes, int, str], Score]
@@ -68,27 +68,29 @@ def decide_sides(first: FirstVolumes, light: LightOptions, told: Hypothesis = ()
     Light makes up for matter that may not be there, and both sides for light. So both sides must predict unseen frames
     better than one, under the light that is `told` alone, and no worse than one in the light that was taken beside it:
     where these are alike, the frames are left alone. Spherical matter, which has the fewest unknowns, is asked for
-    before any on both sides; what predicts unseen views by its few unknowns may yet leave much of those that it was
-    fitted to, so it is refuted where other matter predicts the same views better, their noise apart (data fission).
+    before any on both sides, and must predict more than a sphere on one side. What predicts unseen views by its few
+    unknowns may yet leave much of those that it was fitted to, so it is refuted where other matter predicts the same
+    views better, their noise apart (data fission).
     """
     first.on_progress(STAGE, 0.0)
     one = ABOVE if first.prior.delta_sign > 0 else BELOW
     two = both_sides(first)
     lit, single = f"{one} in {name_of(first.taken)}", Trials(first, light)
-    spheres = replace(two, prior=two.prior.about_a_point(), _made={})
+    spheres, ball = (replace(two, prior=each.prior.about_a_point(), _made={}) for each in (two, first))
     trials = {one: (single, told), SPHERICAL: (Trials(spheres, light), told), BOTH: (Trials(two, light), told)}
     if first.taken != told:
         trials = {one: trials[one], lit: (single, first.taken)} | trials
+    rivals = {BALL: (Trials(ball, light), told)}
 
     def scored(name: str, fold: int) -> Score:
         side, without, _ = name.partition(WITHOUT)
-        tried, taken = trials[side]
+        tried, taken = (trials | rivals)[side]
         try:
             return tried.score(name_of(taken) + without, fold)
         except InputError:  # there is no such matter
             return _without_matter(first, fold)
 
-    beside, by = {name: (name + WITHOUT,) for name in (SPHERICAL, BOTH)}, first.folds.by
+    beside, by = {SPHERICAL: (SPHERICAL + WITHOUT, BALL), BOTH: (BOTH + WITHOUT,)}, first.folds.by
     decision = select(STAGE, tuple(trials), scored, first.folds.count, by=by, beside=beside)
     if decision.choice == SPHERICAL and _refuted({SPHERICAL: spheres, one: first, BOTH: two}, light, told):
         del trials[SPHERICAL]
@@ -130,6 +132,6 @@ def with_sign(prior: MaterialPrior, decisions: Sequence[Decision]) -> MaterialPr
     """`prior` with the sign, or both, that was decided for last, if any was."""
     for each in decisions:
         if each.name == STAGE:
-            sides = {BOTH: prior.on_both_sides, SPHERICAL: prior.about_a_point}.get(each.choice)
+            sides = {BOTH: prior.on_both_sides, SPHERICAL: prior.on_both_sides().about_a_point}.get(each.choice)
             prior = sides() if sides else prior.signed(-1 if each.choice == BELOW else 1)
     return prior

@@ -170,7 +170,7 @@ class FirstVolumes:
             lines = self.once("thickness", 0, self._thickness)[self.folds.kept(fold)]
         values, grid = holographic_tv(even, self.material, self._how, self.on_progress, light, lines=lines)
         if self.prior.spherical:
-            values = likeliest_sphere(WhitenedFrames(even, self.material, light.noise), values)
+            values = likeliest_sphere(WhitenedFrames(even, self.material, light.noise), values, self.prior.lower)
         return VoxelGrid(values[None], grid, Matter.one(*self.material)).on(resolve(self.options.backend))
 
     def _thickness(self) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from typing import Any
@@ -33,13 +34,14 @@ class Sphere:
     """The likeliest spherical volume, by Gauss and Newton's steps with damping (Levenberg 1944, Marquardt 1963).
 
     Unknowns are the centre (z, y, x) in voxels and the values at the radii 0, 1, … voxels up to half the shorter side;
-    they are linear between, and 0 beyond. So few unknowns need no prior: hundreds of pixels tell each of them.
+    they are linear between, and 0 beyond. So few unknowns need no prior: hundreds of pixels tell each of them. In a
+    step those values are fixed at the bound `lower` that the gradient would keep there (Bertsekas 1982).
 
     frames: in units of their noise; start [Z, Y, X]: a volume of them, whose means over spheres are where the fit
     begins, about the point by whose reflection the frames change least (`_symmetric_about`).
     """
 
-    def __init__(self, frames: WhitenedFrames, start: Tensor, backend: str = "cpu") -> None:
+    def __init__(self, frames: WhitenedFrames, start: Tensor, backend: str = "cpu", lower: float = -math.inf) -> None:
         self.problem = VolumeProblem(frames, ContinuousPrior(two_sided=True), 1.0, backend)
         axes = [torch.arange(n, dtype=torch.float64) for n in start.shape]
         self._places = torch.stack(torch.meshgrid(*axes, indexing="ij"))
@@ -50,7 +52,8 @@ class Sphere:
         sums, members = (torch.zeros(count + 1, dtype=torch.float64) for _ in range(2))
         sums.index_add_(0, near, start.double().cpu().flatten())
         members.index_add_(0, near, torch.ones_like(near, dtype=torch.float64))
-        self.unknowns = torch.cat([centre, (sums / members.clamp_min(1))[:count]])
+        self.lower = torch.cat([torch.full((AXES,), -math.inf), torch.full((count,), lower)]).double()
+        self.unknowns = torch.cat([centre, (sums / members.clamp_min(1))[:count]]).maximum(self.lower)
         self.value, self.damping, self.done, self.ended = self._value(self.unknowns), DAMPED, 0, False
 
     def volume(self, unknowns: Tensor | None = None) -> Tensor:
@@ -66,10 +69,14 @@ class Sphere:
             self.problem.lines(self._there(self.volume())),
             [self.problem.lines(self._there(change)) for change in self._changes()],
         )
-        matrix, missing = self.problem.frames.normal_equations(lines, changes)
+        matrix, missing = (each.cpu() for each in self.problem.frames.normal_equations(lines, changes))
+        free = (self.unknowns > self.lower) | (missing > 0)
+        matrix, missing = matrix[free][:, free], missing[free]
         diagonal = torch.diag(matrix.diag().clamp_min(1e-12 * float(matrix.diag().max())))
         while self.damping < MOST_DAMPED:
-            tried = self.unknowns + torch.linalg.solve(matrix + self.damping * diagonal, missing).cpu()
+            tried = self.unknowns.clone()
+            tried[free] += torch.linalg.solve(matrix + self.damping * diagonal, missing)
+            tried = tried.maximum(self.lower)
             value = self._value(tried)
             if value < self.value:
                 self.ended = self.value - value < WORTH or self.done + 1 >= MOST
@@ -111,9 +118,9 @@ def _symmetric_about(volume: Tensor) -> Tensor:
     return 0.5 * torch.tensor([float(n) for n in index], dtype=torch.float64)
 
 
-def likeliest_sphere(frames: WhitenedFrames, start: Tensor) -> Tensor:
+def likeliest_sphere(frames: WhitenedFrames, start: Tensor, lower: float) -> Tensor:
     """The spherical volume [Z, Y, X] at which a `Sphere` ends."""
-    sphere = Sphere(frames, start)
+    sphere = Sphere(frames, start, lower=lower)
     while not sphere.ended:
         sphere.step()
     return sphere.volume().to(start)
@@ -126,9 +133,9 @@ class SphericalFit:
     stopped_early = False
     best_step = 0
 
-    def __init__(self, frames: WhitenedFrames, begun: VoxelGrid, backend: str) -> None:
+    def __init__(self, frames: WhitenedFrames, begun: VoxelGrid, backend: str, lower: float) -> None:
         self.backend, self.seconds, self._begun = resolve(backend), 0.0, begun
-        self._sphere = Sphere(frames, begun.values[0], self.backend)
+        self._sphere = Sphere(frames, begun.values[0], self.backend, lower)
 
     @property
     def step(self) -> int:

@@ -128,7 +128,9 @@ class SmoothStage:
         # one density as a level lost 4 % of the total of balls at 500 photons a pixel, and gained nothing
         known = task.prior.materials if len(task.prior.materials) > 1 else ()
         plan = SmoothPlan(scan, start, noise, task.prior.fixes_ratio, light, *how, backend, known)
-        return SphericalFit(plan.frames(1), start, backend) if task.prior.spherical else SmoothFit(plan)
+        if task.prior.spherical:
+            return SphericalFit(plan.frames(1), start, backend, task.prior.lower)
+        return SmoothFit(plan)
 
 
 def _beside(task: Task, start: VoxelGrid) -> Scan:

@@ -277,8 +277,7 @@ def prior_of(table: Mapping[str, Any]) -> MaterialPrior:
 
 
 def _on_sides(prior: MaterialPrior, table: Mapping[str, Any]) -> MaterialPrior:
-    if table.get("spherical", False):
-        return prior.about_a_point()
+    prior = prior.about_a_point() if table.get("spherical", False) else prior
     return prior.on_both_sides() if table.get("two_sided", False) else prior
 
 
