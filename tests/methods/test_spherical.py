@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -27,7 +25,7 @@ from holosplat.specimens import ExpandingShock, Substances
 from holosplat.specimens.continuous import ContinuousScene, Soft, ellipsoid
 
 WATER = DeltaBeta(5.75e-7, 2.56e-10)
-PIXEL, SHAPE, PHOTONS = 1e-6, (37, 43), 3000.0
+PIXEL, SHAPE, PHOTONS = 1e-6, (45, 51), 3000.0
 VIEWS = Views.from_angles([0.0, 60.0, 120.0], SHAPE, PIXEL)
 SPHERE = MaterialPrior.of_ratio(WATER.ratio).on_both_sides().about_a_point()
 PLAIN = LightOptions("even", still="none", noise="white")
@@ -40,7 +38,7 @@ def of(scene: hs.volume.Object) -> Scan:
 
 @pytest.fixture(scope="module")
 def shock() -> ContinuousScene:
-    found = ExpandingShock(30e-6, shift=0.1).drawn(Substances(WATER, medium=WATER), 4).scene.at(0.7)
+    found = ExpandingShock(38e-6, shift=0.1).drawn(Substances(WATER, medium=WATER), 4).scene.at(0.7)
     assert isinstance(found, ContinuousScene)
     return found
 
@@ -60,7 +58,7 @@ def test_steps_follow_the_derivatives_of_the_volume(scan):
     count = len(sphere.unknowns) - AXES
     assert count == SHAPE[0] // 2
     values = torch.sin(torch.arange(count, dtype=torch.float64))
-    sphere.unknowns = torch.cat([torch.tensor([20.3, 17.6, 21.9], dtype=torch.float64), values])
+    sphere.unknowns = torch.cat([torch.tensor([24.3, 21.6, 25.9], dtype=torch.float64), values])
     for number, change in enumerate(sphere._changes()):
         step = torch.zeros_like(sphere.unknowns)
         step[number] = 1e-3
@@ -118,16 +116,16 @@ def test_a_fit_goes_on_where_it_was(scan):
     assert not part.finished
     rest.load(part.state_dict())
     rest.run(lambda record: None)
-    values = [fit.result().object.values for fit in (whole, rest)]
-    assert torch.equal(*values)
+    first, second = (fit.result().object.voxelise(Grid.of_views(VIEWS)).delta for fit in (whole, rest))
+    assert np.array_equal(first, second)
 
 
 def test_what_is_told_is_kept_in_files():
     for prior in (MaterialPrior.unknown(-1), MaterialPrior.of_ratio(900.0), MaterialPrior.known(WATER)):
+        assert prior.about_a_point().on_both_sides() == prior.on_both_sides().about_a_point() != prior.on_both_sides()
         for told in (prior.about_a_point(), prior.about_a_point().on_both_sides()):
             assert told.spherical
             assert prior_of(told.as_dict()) == told
             assert told.with_ratio(700.0).spherical
-        assert replace(told, spherical=False) == prior.on_both_sides()
     with pytest.raises(InputError, match="must be of one material"):
         MaterialPrior.known(WATER, DeltaBeta(1e-7, 1e-10)).about_a_point()

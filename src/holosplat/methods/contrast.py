@@ -79,7 +79,7 @@ def decide_sides(first: FirstVolumes, light: LightOptions, told: Hypothesis = ()
     spheres, ball = (replace(two, prior=each.prior.about_a_point(), _made={}) for each in (two, first))
     trials = {one: (single, told), SPHERICAL: (Trials(spheres, light), told), BOTH: (Trials(two, light), told)}
     if first.taken != told:
-        trials = {one: trials[one], lit: (single, first.taken)} | trials
+        trials[lit] = single, first.taken
     rivals = {BALL: (Trials(ball, light), told)}
 
     def scored(name: str, fold: int) -> Score:

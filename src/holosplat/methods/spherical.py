@@ -21,6 +21,8 @@ from ..model import Instrument, Model
 from ..representations import VoxelGrid
 
 AXES = 3
+LEAST = 1e-12
+"""Least second derivative, as a share of the largest."""
 DAMPED, EASED, MOST_DAMPED = 1e-3, 10.0, 1e6
 """Damping at first, as a share of each second derivative; the factor by which it falls after a step that helped and
 grows after one that did not; and the one at which the fit ends, for then no step helps."""
@@ -54,7 +56,8 @@ class Sphere:
         members.index_add_(0, near, torch.ones_like(near, dtype=torch.float64))
         self.lower = torch.cat([torch.full((AXES,), -math.inf), torch.full((count,), lower)]).double()
         self.unknowns = torch.cat([centre, (sums / members.clamp_min(1))[:count]]).maximum(self.lower)
-        self.value, self.damping, self.done, self.ended = self._value(self.unknowns), DAMPED, 0, False
+        self.value, self.damping, self.done = self._value(self.unknowns), DAMPED, 0
+        self.cut, self.ended = False, False
 
     def volume(self, unknowns: Tensor | None = None) -> Tensor:
         """The volume [Z, Y, X]."""
@@ -64,27 +67,45 @@ class Sphere:
         return torch.lerp(values[shell], values[shell + 1], part).float()
 
     def step(self) -> None:
-        """One step, if any helps."""
-        lines, changes = (
-            self.problem.lines(self._there(self.volume())),
-            [self.problem.lines(self._there(change)) for change in self._changes()],
-        )
-        matrix, missing = (each.cpu() for each in self.problem.frames.normal_equations(lines, changes))
+        """One step, if any helps; where none does for the first time, the profile is cut (`_cut`), and it goes on."""
+        level = torch.ones_like(self.unknowns)
+        level[AXES:] = float(self.unknowns[AXES:].abs().max()) or 1.0  # in smaller units rounding hides the slopes
+        changes = [one * float(unit) for one, unit in zip(self._changes(), level)]
+        seen = [self.problem.lines(self._there(one)) for one in (self.volume(), *changes)]
+        matrix, missing = (each.cpu() for each in self.problem.frames.normal_equations(seen[0], seen[1:]))
         free = (self.unknowns > self.lower) | (missing > 0)
-        matrix, missing = matrix[free][:, free], missing[free]
-        diagonal = torch.diag(matrix.diag().clamp_min(1e-12 * float(matrix.diag().max())))
-        while self.damping < MOST_DAMPED:
+        diagonal = torch.diag(matrix.diag().clamp_min(LEAST * float(matrix.diag().max())))
+        gained = 0.0
+        while self.damping < MOST_DAMPED and not gained:
             tried = self.unknowns.clone()
-            tried[free] += torch.linalg.solve(matrix + self.damping * diagonal, missing)
+            damped = (matrix + self.damping * diagonal)[free][:, free]
+            tried[free] += level[free] * torch.linalg.solve(damped, missing[free])
             tried = tried.maximum(self.lower)
             value = self._value(tried)
+            self.damping *= 1 / EASED if value < self.value else EASED
             if value < self.value:
-                self.ended = self.value - value < WORTH or self.done + 1 >= MOST
-                self.unknowns, self.value, self.done = tried, value, self.done + 1
-                self.damping /= EASED
-                return
-            self.damping *= EASED
-        self.ended = True
+                gained, self.unknowns, self.value, self.done = self.value - value, tried, value, self.done + 1
+        if gained < WORTH and not self.cut:
+            self._cut(matrix + LEAST * diagonal, self.unknowns / level)
+        else:
+            self.ended = gained < WORTH or self.done >= MOST
+
+    def _cut(self, matrix: Tensor, unknowns: Tensor) -> None:
+        """Leave out the outermost values as far as the frames do not tell them from 0, by Akaike's criterion (1974): a
+        value must gain more than one of the log-likelihood. What slow changes of the profile do inside, which frames
+        hardly tell, goes with what it would be outside; a shock runs into a medium that is even.
+
+        matrix: second derivative of the misfit by the `unknowns` [K], of which without the last the misfit rises by
+        `½ x (C⁻¹) x` of their values x and their covariance C.
+        """
+        covariance, count = torch.linalg.inv(matrix), len(unknowns) - AXES
+        rise = [count * 1.0]
+        for kept in range(count - 1, 0, -1):
+            out = slice(AXES + kept, None)
+            rise.append(0.5 * float(unknowns[out] @ torch.linalg.solve(covariance[out, out], unknowns[out])) + kept)
+        kept = count - int(np.argmin(rise))
+        self.unknowns, self.lower = self.unknowns[: AXES + kept], self.lower[: AXES + kept]
+        self.value, self.damping, self.cut = self._value(self.unknowns), DAMPED, True
 
     def _shells(self, unknowns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Radii [Z, Y, X], the last of the unknown radii below each, and how far beyond it they are."""
@@ -134,13 +155,8 @@ class SphericalFit:
     best_step = 0
 
     def __init__(self, frames: WhitenedFrames, begun: VoxelGrid, backend: str, lower: float) -> None:
-        self.backend, self.seconds, self._begun = resolve(backend), 0.0, begun
+        self.backend, self.step, self.seconds, self._begun = resolve(backend), 0, 0.0, begun
         self._sphere = Sphere(frames, begun.values[0], self.backend, lower)
-
-    @property
-    def step(self) -> int:
-        """Steps that are done."""
-        return self._sphere.done
 
     @property
     def oversample(self) -> int:
@@ -177,6 +193,7 @@ class SphericalFit:
             while not self.finished and (until is None or self.step < until):
                 started = time.perf_counter()
                 self._sphere.step()
+                self.step = self._sphere.done
                 self.seconds += time.perf_counter() - started
                 on_record({"step": self.step, "loss": self._sphere.value, "seconds": self.seconds})
                 release()
@@ -184,15 +201,18 @@ class SphericalFit:
     def state_dict(self) -> dict[str, Any]:
         """Everything that `load` needs to go on as if nothing had happened."""
         sphere = self._sphere
-        numbers = {"value": sphere.value, "damping": sphere.damping, "done": sphere.done, "ended": sphere.ended}
-        return {"unknowns": sphere.unknowns, "seconds": self.seconds, **numbers}
+        numbers = {"value": sphere.value, "damping": sphere.damping, "done": sphere.done}
+        return {
+            "unknowns": sphere.unknowns,
+            "seconds": self.seconds,
+            **numbers,
+            "cut": sphere.cut,
+            "ended": sphere.ended,
+        }
 
     def load(self, state: dict[str, Any]) -> None:
         """Go back to a saved state."""
         sphere, self.seconds = self._sphere, float(state["seconds"])
-        sphere.unknowns, sphere.value, sphere.damping = (
-            state["unknowns"],
-            float(state["value"]),
-            float(state["damping"]),
-        )
-        sphere.done, sphere.ended = int(state["done"]), bool(state["ended"])
+        for name in ("unknowns", "value", "damping", "done", "cut", "ended"):
+            setattr(sphere, name, state[name])
+        sphere.lower, self.step = sphere.lower[: len(sphere.unknowns)], sphere.done

@@ -106,7 +106,8 @@ class SmoothStage:
         light = known and known.part(torch.arange(len(task.scan)), factor)
         backend = options.volume.backend
         material = assumed_material(scan, task.prior, task.on_progress, backend, options.estimate)
-        how = replace(options.volume, upper=0.0, two_sided=task.prior.two_sided)
+        beyond = options.volume.beyond and not task.prior.spherical  # which lies in the frames
+        how = replace(options.volume, upper=0.0, two_sided=task.prior.two_sided, beyond=beyond)
         first, grid = holographic_tv(scan, material, how, task.on_progress, light)
         field = scan.views.padded(margins_of(grid, scan.views))
         return VoxelGrid(first[None], grid, Matter.one(*material)).resampled(Grid.of_views(field))
