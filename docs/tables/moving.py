@@ -107,7 +107,7 @@ def changing() -> str:
         own = [r for r in rows if (r["series"], r["seed"]) == (name, seed)]
         lines.append([f"{name}, {seed}", str(len(own)), *_worst(own), _events(own), _front(own), _spent(own)])
     columns = ("series, seed", "times", "error of δ", "Dice", "total", "holes", "explained", "events told of true ones")
-    return markdown((*columns, "front, pixels", "processor time"), lines)
+    return markdown((*columns, "front, pixels", "time taken"), lines)
 
 
 def _worst(rows: list[Row]) -> list[str]:

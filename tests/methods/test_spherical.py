@@ -11,7 +11,7 @@ from holosplat.checks import InputError
 from holosplat.fit.whitened import WhitenedFrames
 from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta, MaterialPrior
-from holosplat.methods import SmoothVolume, Task
+from holosplat.methods import METHODS, SmoothVolume, Task
 from holosplat.methods.contrast import BELOW, SPHERICAL, decide_sides, with_sign
 from holosplat.methods.illumination import prepared
 from holosplat.methods.method import first_of_task
@@ -86,6 +86,8 @@ def test_spherical_matter_is_taken_where_it_predicts_unseen_frames(scan):
     task = prepared(Task(scan, MaterialPrior.of_ratio(WATER.ratio), light=PLAIN), SmoothVolume())
     assert task.decisions[-1].choice == SPHERICAL
     assert task.prior.spherical
+    other = prepared(Task(scan, MaterialPrior.of_ratio(WATER.ratio), light=PLAIN), METHODS["voxels"])
+    assert not other.prior.spherical
     assert with_sign(MaterialPrior.of_ratio(WATER.ratio), task.decisions).spherical
     assert task.first is not None
     before = (tuple(task.first.taken), task.decisions)

@@ -62,7 +62,9 @@ def decide_sign(first: FirstVolumes, *scores: Scoring) -> tuple[FirstVolumes, tu
     return volumes[decision.choice], (decision,)
 
 
-def decide_sides(first: FirstVolumes, light: LightOptions, told: Hypothesis = ()) -> tuple[FirstVolumes, Decision]:
+def decide_sides(
+    first: FirstVolumes, light: LightOptions, told: Hypothesis = (), spherical: bool = True
+) -> tuple[FirstVolumes, Decision]:
     """The first volumes of matter on one side of its medium, or on both, perhaps spherical, and the decision.
 
     Light makes up for matter that may not be there, and both sides for light. So both sides must predict unseen frames
@@ -70,7 +72,7 @@ def decide_sides(first: FirstVolumes, light: LightOptions, told: Hypothesis = ()
     where these are alike, the frames are left alone. Spherical matter, which has the fewest unknowns, is asked for
     before any on both sides, and must predict more than a sphere on one side. What predicts unseen views by its few
     unknowns may yet leave much of those that it was fitted to, so it is refuted where other matter predicts the same
-    views better, their noise apart (data fission).
+    views better, their noise apart (data fission). spherical: whether it is asked for, as methods that have it do.
     """
     first.on_progress(STAGE, 0.0)
     one = ABOVE if first.prior.delta_sign > 0 else BELOW
@@ -80,6 +82,8 @@ def decide_sides(first: FirstVolumes, light: LightOptions, told: Hypothesis = ()
     trials = {one: (single, told), SPHERICAL: (Trials(spheres, light), told), BOTH: (Trials(two, light), told)}
     if first.taken != told:
         trials[lit] = single, first.taken
+    if not spherical:
+        del trials[SPHERICAL]
     rivals = {BALL: (Trials(ball, light), told)}
 
     def scored(name: str, fold: int) -> Score:
@@ -93,8 +97,7 @@ def decide_sides(first: FirstVolumes, light: LightOptions, told: Hypothesis = ()
     beside, by = {SPHERICAL: (SPHERICAL + WITHOUT, BALL), BOTH: (BOTH + WITHOUT,)}, first.folds.by
     decision = select(STAGE, tuple(trials), scored, first.folds.count, by=by, beside=beside)
     if decision.choice == SPHERICAL and _refuted({SPHERICAL: spheres, one: first, BOTH: two}, light, told):
-        del trials[SPHERICAL]
-        decision = select(STAGE, tuple(trials), scored, first.folds.count, by=by, beside=beside)
+        return decide_sides(first, light, told, spherical=False)
     found = {SPHERICAL: spheres, BOTH: two}.get(decision.choice)
     return (found, decision) if found else (first, replace(decision, choice=one))
 

@@ -17,6 +17,7 @@ from torch import Tensor
 from ..backends import resolve
 from ..baselines import HolographicTV, holographic_tv
 from ..baselines.algebraic import Algebraic, sirt
+from ..baselines.beyond import margins_of
 from ..baselines.holographic_tv import retrieved
 from ..fit.whitened import WhitenedFrames
 from ..geometry import Grid
@@ -170,7 +171,9 @@ class FirstVolumes:
             lines = self.once("thickness", 0, self._thickness)[self.folds.kept(fold)]
         values, grid = holographic_tv(even, self.material, self._how, self.on_progress, light, lines=lines)
         if self.prior.spherical:
-            values = likeliest_sphere(WhitenedFrames(even, self.material, light.noise), values, self.prior.lower)
+            beyond = margins_of(grid, seen.views)
+            frames = WhitenedFrames(even, self.material, light.noise, beyond=beyond)
+            values = likeliest_sphere(frames, values, self.prior.lower)
         return VoxelGrid(values[None], grid, Matter.one(*self.material)).on(resolve(self.options.backend))
 
     def _thickness(self) -> Tensor:

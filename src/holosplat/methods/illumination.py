@@ -154,7 +154,8 @@ def prepared(task: Task, method: Method | None = None, before: Prepared | None =
         task.on_progress(STAGE, 0.0)
         first.taken, made = decided(first, options, told, tuple(open_to))
         if _may_have_both_sides(task, method, first):
-            first, sides = decide_sides(first, options, told)
+            spherical = isinstance(method, Auto | SmoothVolume)
+            first, sides = decide_sides(first, options, told, spherical)
             task = replace(task, prior=with_sign(task.prior, (sides,)), decisions=(*task.decisions, sides))
             if task.prior.two_sided:
                 first.taken, made = decided(first, options, told, tuple(open_to))
