@@ -173,11 +173,15 @@ class SphericalFit:
         """How much of the work is done."""
         return 1.0 if self.finished else self.step / MOST
 
+    @property
+    def voxels(self) -> VoxelGrid:
+        """The volume as it is now."""
+        return self._begun.with_parameters({"values": self._sphere.volume()[None]})
+
     def result(self) -> Model:
         """The model of the volume as it is now."""
-        found = self._begun.with_parameters({"values": self._sphere.volume()[None]})
         exposures = self._sphere.problem.frames.train.exposures
-        return Model(found, Instrument(exposures, self.oversample, backend=self.backend))
+        return Model(self.voxels, Instrument(exposures, self.oversample, backend=self.backend))
 
     def resolved(self) -> dict[str, Any]:
         """What the options have become."""
