@@ -178,7 +178,7 @@ def main() -> None:
     parser.add_argument("--machine", default="x86_64, one core, shared")
     chosen = parser.parse_args()
     torch.set_num_threads(1)
-    for seed, tangent, method in product((1, 2), (0.1, 0.3), ("tikhonov-tv", "voxels") if chosen.runs else ()):
+    for seed, tangent, method in product((1, 2), (0.1, 0.3), ("tikhonov-tv", "voxels", "auto") if chosen.runs else ()):
         for beam in ("cone", "parallel", "taken for parallel"):
             row = run(tangent, beam, method, seed)
             shown(row)

@@ -77,7 +77,7 @@ def pairs(arrays: list[Tensor], poses: tuple[Tensor, Tensor], sizes: Sizes) -> i
     centres, scales, quaternions = (a.double() for a in arrays[:3])
     total = 0
     for rotation, shift in zip(*poses):
-        projected = reference._projected(centres, scales, quaternions, rotation, shift)
+        projected = reference._projected(centres, scales, quaternions, rotation, shift)[:2]
         low, high = reference.boxes(*projected, (sizes.side, sizes.side), CUTOFF, VARIANCE)
         total += int((high - low + 1).clamp(min=0).prod(1).sum())
     return total

@@ -85,7 +85,7 @@ def splat_pairs(work: Workload) -> int:
     centres, scales, quaternions, _ = (a.double() for a in work.cloud())
     total = 0
     for rotation, shift in zip(*work.poses()):
-        exact = reference._projected(centres, scales, quaternions, rotation, shift)
+        exact = reference._projected(centres, scales, quaternions, rotation, shift)[:2]
         low, high = reference.boxes(*exact, (work.size,) * 2, work.cutoff, VARIANCE)
         total += int((high - low + 1).clamp(min=0).prod(1).sum())
     return total

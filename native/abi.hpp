@@ -31,11 +31,13 @@ struct HoloViews {
   int64_t count, height, width;
   const double* rotations;  // [V, 3, 3] x_lab = R x_object
   const double* shifts;     // [V, 2] detector shift (sx, sy)
+  const double* curvatures; // [V] one over the distance of the source at (0, 0, -R) of the lab; null: parallel beams
 };
 
 struct HoloViewGradients {  // of a scalar with respect to the arrays of a HoloViews, in their shapes
   double* rotations;  // as if all nine numbers of a matrix were free
   double* shifts;
+  double* curvatures;  // null in parallel beams
 };
 
 struct HoloGrid {

@@ -133,7 +133,7 @@ class Views:
         if self.sources is not None:
             raise InputError(
                 f"{what} needs parallel beams, but these diverge from a source {self.sources.min(initial=np.inf):g} m "
-                "before the object; take a method for cones, voxels or tikhonov-tv (docs/howto/which_instrument.md)."
+                "before the object; docs/howto/which_instrument.md says what takes cones."
             )
         return self
 

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from .checks import MissingError
 
-ABI = 9
+ABI = 10
 ISAS = ("sse2", "avx2", "avx512")
 """Builds for x86-64, slowest first. Other processors have one build, `generic`."""
 
@@ -42,13 +42,13 @@ class Gradients(ctypes.Structure):
 
 
 class ViewGradients(ctypes.Structure):
-    """Where the gradients of the views' two arrays go, float64."""
+    """Where the gradients of the views' arrays go, float64; curvatures only in cones."""
 
-    _fields_ = [(name, c_void_p) for name in ("rotations", "shifts")]
+    _fields_ = [(name, c_void_p) for name in ("rotations", "shifts", "curvatures")]
 
 
 class Views(ctypes.Structure):
-    """V views on one raster: counts and pointers to float64 arrays."""
+    """V views on one raster: counts and pointers to float64 arrays; curvatures, 1 / source distance, in cones."""
 
     _fields_ = [
         ("count", c_int64),
@@ -56,6 +56,7 @@ class Views(ctypes.Structure):
         ("width", c_int64),
         ("rotations", c_void_p),
         ("shifts", c_void_p),
+        ("curvatures", c_void_p),
     ]
 
 

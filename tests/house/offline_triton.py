@@ -96,8 +96,9 @@ def operations(every_size: bool) -> list[Callable[[], None]]:
     def cloud(channels: int) -> list[Tensor]:
         return [torch.ones(5, width, requires_grad=True) for width in (3, 3, 4, channels)]
 
-    def splat(channels: int, of_poses: bool = False) -> None:
-        poses = (torch.eye(3, dtype=torch.float64)[None], torch.zeros(1, 2, dtype=torch.float64))
+    def splat(channels: int, of_poses: bool = False, cone: bool = False) -> None:
+        curvatures = torch.full((1,), 0.01, dtype=torch.float64) if cone else None
+        poses = (torch.eye(3, dtype=torch.float64)[None], torch.zeros(1, 2, dtype=torch.float64), curvatures)
         poses[0].requires_grad_(of_poses)
         splats.splat(*cloud(channels), *poses, (8, 9), 4.0, 1 / 12).sum().backward()
 
@@ -157,7 +158,8 @@ def operations(every_size: bool) -> list[Callable[[], None]]:
     if every_size:
         calls += [lambda: wide(splat, triton_pixels), lambda: wide(voxelise, triton_boxes)]
     for c in (1, 2) if every_size else (2,):
-        calls += [lambda c=c: splat(c), lambda c=c: splat(c, True), lambda c=c: voxelise(c)]
+        calls += [lambda c=c, p=p, k=k: splat(c, p, k) for p in (False, True) for k in (False, True)]
+        calls += [lambda c=c: voxelise(c)]
     return calls
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -85,11 +86,14 @@ def test_mass_and_chords_of_profiles_are_their_integrals(profile):
     assert float(profile.chord(np.float64(1.01 * profile.reach**2))) == 0
 
 
+@pytest.mark.parametrize("source", [None, 120e-6])
 @pytest.mark.parametrize("profile", [Soft(0.5), Bump(2)], ids=str)
-def test_line_integrals_are_those_of_the_density(profile):
+def test_line_integrals_are_those_of_the_density(profile, source):
     """Each of the rays of a pixel of an odd, rectangular detector, tilted and shifted, by adaptive quadrature."""
     element = one(profile, (8e3, -5e3, 6e3))
     views = tilted_views((9, 13), 4e-6)
+    if source is not None:
+        views = replace(views, sources=np.full(len(views), source))
     lines = ContinuousScene((element,)).project(views)
     assert lines.materials == (tuple(MATTER),)
     found, fine = lines[1].numpy(), views.refined(2)
@@ -100,12 +104,28 @@ def test_line_integrals_are_those_of_the_density(profile):
                 x = (column + 0.5 - fine.shape[1] / 2) * fine.pixel_size + fine.shifts[v, 0]
                 y = (row + 0.5 - fine.shape[0] / 2) * fine.pixel_size + fine.shifts[v, 1]
 
-                def along(z, at=(x, y), rotation=fine.rotations[v]):
-                    return float(element.density(rotation.T @ np.array([*at, 1e-6 * z])))
+                way = np.array([0.0, 0.0, 1.0] if source is None else [x, y, source])
+                way /= np.linalg.norm(way)
+
+                def along(t, at=(x, y, 0.0), way=way, rotation=fine.rotations[v]):
+                    return float(element.density(rotation.T @ (np.array(at) + 1e-6 * t * way)))
 
                 rays.append(quad(along, -60, 60, limit=300, points=[0.0], epsabs=1e-8)[0] * 1e-6)
         assert found[v, i, j] == near(MATTER.delta * np.mean(rays), rel=1e-5, abs=1e-18)
     assert found.max() > 1e-6 * MATTER.delta
+
+
+def test_a_scene_in_a_cone_reaches_as_far_as_its_lines_and_lies_beyond_the_source():
+    """As far as the box that holds it, at most two pixels of 1 µm more; and a source within the scene is refused."""
+    scene = ContinuousScene((one(Soft(0.5)),))
+    views = replace(tilted_views((41, 61), 1e-6), sources=np.full(2, 150e-6))
+    beyond = scene.missing_field(views)
+    rows, columns = np.nonzero(scene.project(views)[1].amax(0).numpy())
+    margin = min(rows.min(), columns.min(), 40 - rows.max(), 60 - columns.max())
+    assert -0.5e-6 < 1e-6 * margin + beyond < 2.5e-6
+    assert scene.missing_field(replace(views, sources=None)) < beyond
+    with pytest.raises(InputError, match="the source must lie before the specimen"):
+        scene.project(replace(views, sources=np.full(2, 10e-6)))
 
 
 @pytest.mark.parametrize("profile", PROFILES, ids=str)

@@ -133,6 +133,7 @@ def align(
     from ..align import AlignedBeams, align_views, find_axis
     from ..io.atomic import require_writable
     from ..io.formats import read_frames
+    from ..io.half_acquisition import heightened, of_parts
     from ..io.nxtomo import write_scan
     from ..planning.acts import of_alignment
     from ..scan import Scan
@@ -157,9 +158,10 @@ def align(
             axis = find_axis(measured, ratio=_ratio(prior), light=light, on_progress=show)
         lines, exposures = axis.lines(), axis.applied(measured.exposures)
     else:
+        tall = heightened(measured)
         with ProgressBar() as bar:
-            found = align_views(measured, prior, how, light=illumination.options(), on_progress=bar.show)
-        lines, exposures, errors = found.lines(), found.exposures, found.errors
+            found = align_views(tall, prior, how, light=illumination.options(), on_progress=bar.show)
+        lines, exposures, errors = found.lines(), of_parts(found.exposures, tall, measured), found.errors
         if isinstance(found, AlignedBeams):
             if any(found.sides):
                 frames = found.upright(measured.frames)

@@ -1,8 +1,11 @@
-"""Half acquisition: a whole turn with the axis near an edge of the frames, whose opposite frames complete each other.
+"""Scans that sweep more than a frame shows, as scans of larger frames.
 
-A frame at θ + 180° is the mirror image of that at θ about the axis. Each frame of the first half turn is joined with
-its opposite one to a frame as wide as what the turn sweeps, so that all that follows sees a usual scan of half a turn.
-A tube about the axis is divided out here, too, for it needs the axis.
+Half acquisition: a whole turn with the axis near an edge of the frames, whose opposite frames complete each other. A
+frame at θ + 180° is the mirror image of that at θ about the axis. Each frame of the first half turn is joined with its
+opposite one to a frame as wide as what the turn sweeps, so that all that follows sees a usual scan of half a turn.
+
+Helix: the object moves along the axis by more than a frame while it turns. Each frame is a part of a taller one, whose
+other rows have no value. A tube about the axis is divided out here, too, for it needs the axis.
 """
 
 from __future__ import annotations
@@ -17,7 +20,7 @@ from ..frames import Derived, Frames, Taken
 from ..geometry import Views
 from ..preprocess.pixels import filled
 from ..ranges import ranged
-from ..scan import Scan
+from ..scan import Exposures, Scan
 from ..tables import number_in, shown
 from .angles import angles_of, is_half_acquisition
 
@@ -91,7 +94,7 @@ class Stitched(Derived):
         total, weight = np.zeros((2, len(numbers), *self.shape[1:]))
         ways = (self._raster.upright, self._raster.mirrored)
         for which, place, share in zip(self._pairs[numbers].T, ways, self._raster.weights()):
-            frames, missing = self._taken(which)
+            frames, missing = _taken(self._frames, self._missing, which)
             known = share if missing is None else share * (place(missing.astype(np.float32)) < 0.5)
             total += place(frames) * known
             weight += known
@@ -101,10 +104,60 @@ class Stitched(Derived):
             return found, None
         return filled("the stitched frames", found, np.zeros(none.shape, dtype=bool), none, numbers)
 
-    def _taken(self, numbers: np.ndarray) -> Taken:
-        if isinstance(self._frames, Frames):
-            return self._frames.with_missing(numbers)
-        return self._frames[numbers], None if self._missing is None else self._missing[numbers]
+
+class Placed(Derived):
+    """Frames as parts of taller ones of `rows` rows, from the row `first` [N] on; beyond, their outermost rows stand
+    for what is not known."""
+
+    def __init__(self, frames: np.ndarray | Frames, missing: np.ndarray | None, first: np.ndarray, rows: int) -> None:
+        self._frames, self._missing, self._first = frames, missing, first
+        self.shape = (len(first), rows, frames.shape[2])
+
+    def with_missing(self, numbers: np.ndarray) -> Taken:
+        """See `Frames.with_missing`."""
+        frames, missing = _taken(self._frames, self._missing, numbers)
+        row = np.arange(self.shape[1]) - self._first[numbers][:, None]
+        nearest = row.clip(0, frames.shape[1] - 1)[:, :, None]
+        gaps = np.zeros((len(numbers), *self.shape[1:]), dtype=bool)
+        gaps |= (row != nearest[:, :, 0])[:, :, None]
+        if missing is not None:
+            gaps |= np.take_along_axis(missing, nearest, 1)
+        return np.take_along_axis(frames, nearest, 1), gaps
+
+
+def _taken(frames: np.ndarray | Frames, missing: np.ndarray | None, numbers: np.ndarray) -> Taken:
+    """The frames `numbers`, with their missing pixels."""
+    if isinstance(frames, Frames):
+        return frames.with_missing(numbers)
+    return frames[numbers], None if missing is None else missing[numbers]
+
+
+def heightened(scan: Scan) -> Scan:
+    """The scan on frames as tall as what the views show together, if these turn about one axis and move along it so far
+    that none of its rows is in all frames, which is said; else the scan as it is."""
+    views = scan.views
+    upright = np.allclose(views.rotations[:, 1], [0.0, 1.0, 0.0]) and views.has_one_pixel and views.sources is None
+    rows, height = views.shifts[:, 1] / views.pixel_size if upright else np.zeros(len(views)), views.shape[0]
+    if scan.is_series or not len(views) or np.ptp(rows) < height:
+        return scan
+    first = np.round(rows - rows.min()).astype(int)
+    more = int(first.max())
+    frames = Placed(scan.source, None if isinstance(scan.source, Frames) else scan.missing, first, height + more)
+    shifts = views.shifts.copy()
+    shifts[:, 1] = (rows - first + 0.5 * more) * views.pixel_size
+    note(
+        f"helix: the frames move by {np.ptp(rows):.4g} rows along the axis, and become parts of frames of "
+        f"{height + more} rows in place of {height}"
+    )
+    tall = replace(views, shifts=shifts, shape=(height + more, views.shape[1]))
+    said = scan.provenance | {"heightened": "a helix"}
+    return Scan.of(frames, replace(scan.exposures, views=tall), scan.is_test, said)
+
+
+def of_parts(found: Exposures, tall: Scan, scan: Scan) -> Exposures:
+    """The exposures of the frames of `scan`, from those `found` of the frames of `tall`, its `heightened` scan."""
+    shifts = found.views.shifts + scan.views.shifts - tall.views.shifts
+    return replace(found, views=replace(found.views, shifts=shifts, shape=scan.views.shape))
 
 
 def stitched(scan: Scan) -> Scan:

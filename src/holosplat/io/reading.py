@@ -264,13 +264,14 @@ class Reading:
     def applied(self, scan: Scan, joined: bool = True) -> Scan:
         """A scan that a loader has read, with its axis and sense of rotation, and cut to the part that is taken.
 
-        joined: whether opposite frames of a half acquisition become wider ones (`stitched`).
+        joined: whether opposite frames of a half acquisition become wider ones (`stitched`), and those of a helix
+            taller ones (`heightened`).
         """
         scan = self.told.placed(scan)
         if joined:
-            from .half_acquisition import stitched  # SciPy, without which help is printed
+            from .half_acquisition import heightened, stitched  # SciPy, without which help is printed
 
-            scan = stitched(scan)
+            scan = heightened(stitched(scan))
         tell_views(scan)
         if self.told.tube is not None:
             from .half_acquisition import Tube

@@ -24,6 +24,7 @@ class Auto(Method):
     """Matter with levels: Gaussians, and closed surfaces where there are bodies. Continuous matter: a smooth volume."""
 
     kind: ClassVar[str] = "auto"
+    cones: ClassVar[bool] = True
     any_backend: ClassVar[bool] = True
     mixes_kinds: ClassVar[bool] = True
     """A volume may take the place of bodies."""
@@ -61,6 +62,7 @@ class Bodies(Method):
     """Gaussians, and surfaces where these enclose bodies of one material."""
 
     kind: ClassVar[str] = "bodies"
+    cones: ClassVar[bool] = True
     mixes_kinds: ClassVar[bool] = True
 
     gaussians: Gaussians

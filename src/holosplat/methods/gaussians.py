@@ -56,6 +56,7 @@ class Gaussians(GaussianOptions, Method):
     """
 
     kind: ClassVar[str] = "gaussians"
+    cones: ClassVar[bool] = True
     any_backend: ClassVar[bool] = True
     two_sided: ClassVar[bool] = True
 

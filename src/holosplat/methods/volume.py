@@ -47,6 +47,7 @@ class SmoothVolume(Method):
     """
 
     kind: ClassVar[str] = "volume"
+    cones: ClassVar[bool] = True
     likelier: ClassVar[bool] = True
     two_sided: ClassVar[bool] = True
 

@@ -128,10 +128,11 @@ def evenly(numbers: np.ndarray, most: int) -> np.ndarray:
 def _facts(path: Path, reading: Reading, loader: Loader, opened: Opened, unsaid: Unsaid) -> ScanFacts:
     scan, file = reading.applied(opened[0]), opened[1]
     numbers = evenly(np.arange(len(scan)), LOOKED)
-    look = looked(np.asarray(scan.source[numbers]))
+    own = reading.applied(opened[0], joined=False) if "heightened" in scan.provenance else scan
+    look = looked(np.asarray(own.source[numbers]))
     rows = {"what": f"a scan: {loader.mark} ({loader.name})"} | keys_of(path) | _frames(scan, file)
     rows |= _beam(scan.exposures, unsaid) | _angles(scan, file, unsaid)
-    likeness = None if "angles_deg" in unsaid else opposite_likeness(scan.views[numbers], look.frames)
+    likeness = None if "angles_deg" in unsaid else opposite_likeness(own.views[numbers], look.frames)
     if likeness is not None:
         rows["half a turn on"] = (
             f"frames are mirrored about this axis: correlation {likeness:.2f} (1 where it is right)"
@@ -139,8 +140,7 @@ def _facts(path: Path, reading: Reading, loader: Loader, opened: Opened, unsaid:
     rows |= look.rows()
     if look.is_light and unsaid.keys().isdisjoint(OPTICS):
         rows["fringes"] = look.fringes(fringes(scan.exposures) / scan.views.pixel_sizes)
-    cones = scan.views.sources is not None  # which the default method refuses
-    if look.is_light and not unsaid and not cones:
+    if look.is_light and not unsaid:
         rows |= _needs(scan, numbers)
     missing = list(dict.fromkeys(unsaid.values()))
     if not look.is_light:
@@ -154,7 +154,7 @@ def _facts(path: Path, reading: Reading, loader: Loader, opened: Opened, unsaid:
         )
     words = ["holosplat reconstruct", shlex.quote(str(path)), *_options(reading)]
     words += [f"--{OPTIONS.get(name, name)} …" for name in unsaid]
-    more = " ".join([*words, *["--motion each"] * scan.is_series, *["--method tikhonov-tv"] * cones, "--out run"])
+    more = " ".join([*words, *["--motion each"] * scan.is_series, "--out run"])
     matter = "not in the file; --material NAME or --delta-beta RATIO says it, else δ/β is estimated"
     facts = Facts(rows | {"material": matter}, tuple(missing), (more,) if look.is_light else ())
     return ScanFacts(facts, scan, look, numbers, tuple(unsaid))
@@ -233,7 +233,9 @@ def opposite_likeness(views: Views, frames: np.ndarray) -> float | None:
     if angles is None or not views.has_one_pixel:
         return None
     pairs = combinations(range(len(angles)), 2)
-    pair = next((p for p in pairs if abs((angles[p[1]] - angles[p[0]]) % 360 - 180) < SAME_DEG), None)
+    rows = views.shifts[:, 1] / views.pixel_size
+    level = (p for p in pairs if round(rows[p[1]] - rows[p[0]]) == 0)
+    pair = next((p for p in level if abs((angles[p[1]] - angles[p[0]]) % 360 - 180) < SAME_DEG), None)
     if pair is None:
         return None
     columns = np.arange(views.shape[1])

@@ -132,9 +132,8 @@ class GaussianCloud:
         """Line integrals [V, C, H, W] of the amplitudes, in units of `unit_length`.
 
         Views are checked, Poses (on the cloud's device) are taken as they are, without waiting for a GPU. Gradients
-        reach the cloud's parameters, and the rotations, shifts and scales of Poses that require them.
+        reach the cloud's parameters, and the rotations, shifts, scales and sources of Poses that require them.
         """
-        views.parallel("a cloud of Gaussians")
         poses = Poses.of(views, self.centres.device) if isinstance(views, Views) else views
         scale = self.unit_length / poses.pitch
         return splat(
@@ -144,6 +143,7 @@ class GaussianCloud:
             shifts=poses.shifts / poses.pitch,
             shape=poses.shape,
             pixels=poses.scales,
+            sources=None if poses.sources is None else poses.sources / poses.pitch,
             backend=self.backend,
             trusted=not isinstance(views, Views),
         )

@@ -227,14 +227,15 @@ class ContinuousScene:
         half = 0.5 * views.fields
         worst = -math.inf
         for element in self.elements:
-            centre = (views.rotations @ element.centre)[:, :2] - views.shifts
-            extent = element.profile.reach * np.linalg.norm(element.axes @ views.rotations.transpose(0, 2, 1), axis=1)
-            worst = max(worst, float((np.abs(centre) + extent[:, :2] - half).max()))
+            low, high = _shadow(element, views)
+            worst = max(worst, float(np.maximum(high - views.shifts - half, views.shifts - half - low).max()))
         return worst
 
     def project(self, views: Views) -> LineIntegrals:
-        """Line integrals of each of `kinds`, float64: the mean of `RAYS`² exact ones a pixel."""
-        views.parallel("a continuous specimen")
+        """Line integrals of each of `kinds`, float64: the mean of `RAYS`² exact ones a pixel.
+
+        Errors: `InputError` where a cone's source lies in an element's depth or before it.
+        """
         fine, kinds = views.refined(RAYS), self.kinds
         channels = np.zeros((len(views), len(kinds), *fine.shape))
         for v in range(len(views)):
@@ -316,19 +317,38 @@ def _add_lines(channels: np.ndarray, element: Element, shares: Sequence[float], 
     a = element.inverse @ rotation.T  # s = |a (x_lab - c_lab)|
     centre, gradient = rotation @ element.centre, rotation @ element.gradient
     x, y = (np.arange(w) + 0.5 - w / 2) * p + sx, (np.arange(h) + 0.5 - h / 2) * p + sy
-    half = element.profile.reach * np.linalg.norm(element.axes @ rotation.T, axis=0)
-    columns, rows = _box((x, y), centre[:2], half[:2], (p, p))
+    low, high = (end[0] for end in _shadow(element, view))
+    columns, rows = _box((x, y), 0.5 * (low + high), 0.5 * (high - low), (p, p))
     if columns.stop <= columns.start or rows.stop <= rows.start:
         return
-    dx, dy = x[columns][None, :] - centre[0], y[rows][:, None] - centre[1]
-    along = float(a[:, 2] @ a[:, 2])
-    slope = -(a[:, :2].T @ a[:, 2]) / along  # dz of the line's point nearest to the centre, for dx and dy of 1
-    q = (a.T @ a)[:2, :2] - along * np.outer(slope, slope)
-    b2 = np.maximum(q[0, 0] * dx * dx + 2 * q[0, 1] * dx * dy + q[1, 1] * dy * dy, 0)
-    g = gradient[:2] + gradient[2] * slope
-    lines = element.profile.chord(b2) / math.sqrt(along) * (1 + g[0] * dx + g[1] * dy)
+    place = np.stack(np.broadcast_arrays(x[columns][None, :], y[rows][:, None], 0.0))  # of pixels
+    way = np.array([0.0, 0.0, 1.0])[:, None, None]  # of rays
+    if view.sources is not None:
+        way = place + view.sources[0] * way
+        way = way / np.linalg.norm(way, axis=0)
+    away = place - centre[:, None, None]
+    from_centre, ahead = np.tensordot(a, away, 1), np.tensordot(a, way, 1)
+    along = np.square(ahead).sum(0)
+    nearest = -(from_centre * ahead).sum(0) / along  # the ray's point that is nearest to the centre
+    b2 = np.square(from_centre + nearest * ahead).sum(0)
+    lines = element.profile.chord(b2) / np.sqrt(along) * (1 + np.tensordot(gradient, away + nearest * way, 1))
     for channel, share in zip(channels, shares):
         channel[rows, columns] += share * lines
+
+
+def _shadow(element: Element, views: Views) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper corners [V, 2] `(x, y)` [m] of what holds an element in the plane of the pixels."""
+    centre = views.rotations @ element.centre
+    half = element.profile.reach * np.linalg.norm(element.axes @ views.rotations.transpose(0, 2, 1), axis=1)
+    corners = np.stack([centre - half, centre + half])
+    if views.sources is None:
+        return corners[0, :, :2], corners[1, :, :2]
+    depth = 1 + corners[:, :, 2:] / views.sources[:, None]
+    require(
+        bool((depth > 0).all()), "the source must lie before the specimen, but it is beside or behind a part of it."
+    )
+    seen = (corners[:, None, :, :2] / depth).reshape(4, -1, 2)
+    return seen.min(0), seen.max(0)
 
 
 def _voxel_means(element: Element, grid: Grid, box: tuple[slice, ...]) -> np.ndarray:

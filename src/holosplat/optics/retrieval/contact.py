@@ -145,6 +145,40 @@ def without_wall(
     return found
 
 
+def _bands(missing: Tensor | None, rows: int) -> np.ndarray:
+    """First row and the one after the last [V, 2] of those of each frame that have a pixel with a value; of a frame
+    without any, all."""
+    if missing is None:
+        return np.array([[0, rows]])
+    known = (~missing).any(2).cpu().numpy()
+    bands = np.stack([known.argmax(1), rows - known[:, ::-1].argmax(1)], 1)
+    return np.where(known.any(1, keepdims=True), bands, [0, rows])
+
+
+def _in_bands(
+    method: Callable[..., Tensor], frames: Tensor, exposures: Exposures, missing: Tensor, bands: np.ndarray
+) -> Tensor:
+    """What `method` retrieves of frames as large as their `bands` of rows, beyond which it is as in the outermost ones.
+
+    Rows without any value say nothing, so that such a frame is a smaller one (`io.half_acquisition.heightened`).
+    """
+    found, counts = torch.empty_like(frames), bands[:, 1] - bands[:, 0]
+    for count in np.unique(counts):
+        some = np.flatnonzero(counts == count)
+        rows = torch.from_numpy(bands[some, 0][:, None] + np.arange(count)).to(frames.device)
+        at = torch.from_numpy(some).to(frames.device)[:, None]
+        part = exposures[some]
+        views, (h, w) = part.views, frames.shape[1:]
+        moved = (0.5 * (bands[some].sum(1) - h)) * views.pixel_sizes
+        shifts = views.shifts + np.stack([np.zeros(len(some)), moved], 1)
+        part = replace(part, views=replace(views, shape=(int(count), w), shifts=shifts))
+        gaps = missing[at, rows]
+        band = method(frames[at, rows], part, missing=gaps if gaps.any() else None)
+        nearest = (torch.arange(h, device=frames.device) - rows[:, :1]).clamp(0, int(count) - 1)
+        found[at[:, 0]] = band[torch.arange(len(some), device=frames.device)[:, None], nearest]
+    return found
+
+
 def or_in_contact(method: Method) -> Method:
     """`method` for the views that show refraction, and `contact_thickness` for those that show absorption alone; beside
     a wall that is known, for frames as if without it (`without_wall`)."""
@@ -164,7 +198,9 @@ def or_in_contact(method: Method) -> Method:
             return without_wall(alone, frames, exposures, (delta, beta))
         exposures = exposures.optical
         checked(frames, exposures, delta)
-        poses = SharedPoses(exposures)
+        poses, bands = SharedPoses(exposures), _bands(missing, frames.shape[1])
+        if missing is not None and not poses.any and (bands[:, 1] - bands[:, 0] < frames.shape[1]).any():
+            return _in_bands(partial(retrieve, delta=delta, beta=beta, **options), frames, exposures, missing, bands)
         alone = absorption_alone(exposures, beta / delta)
         if poses.any:  # beside frames at a distance, those in contact have their part in the waves
             alone = poses.mean(torch.from_numpy(alone).double()).numpy() == 1

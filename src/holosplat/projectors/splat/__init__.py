@@ -1,4 +1,4 @@
-"""Gaussians in parallel beams: line integrals (`splat`) and samples on a voxel raster (`voxelise`).
+"""Gaussians in parallel beams or cones: line integrals (`splat`) and samples on a voxel raster (`voxelise`).
 
 A cloud of N Gaussians has, with every length in PIXELS (the caller scales from metres and back):
 
@@ -9,7 +9,7 @@ Gaussian `a exp(-½ (x-c)ᵀ Σ⁻¹ (x-c))`, whose covariance is `Σ = R_q diag
 
 Backends: `cpu` (C++, float32), `cuda` (Triton, float32, tensors on the GPU) and `reference` (plain torch, any float
 type and device, slow), which is the specification of the others. All give gradients of the four arrays above, and of
-the views' rotations and shifts where those are tensors that require them.
+the views' rotations, shifts and sources where those are tensors that require them.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ def splat(
     shape: tuple[int, int],
     *,
     pixels: Tensor | None = None,
+    sources: Tensor | None = None,
     backend: str = "cpu",
     cutoff: float = 4.0,
     pixel_variance: float = 1 / 12,
@@ -44,11 +45,16 @@ def splat(
     The cloud is described at the top of this module. rotations [V, 3, 3]: `x_lab = R x_obj`, the beam along +z_lab;
     shifts [V, 2]: detector shifts `(sx, sy)` [px]. Pixel `(i, j)` of `shape = (H, W)` has its centre at
     `x = (j + ½ - W/2) + sx`, `y = (i + ½ - H/2) + sy`. A gradient of the rotations treats their nine numbers as free
-    (the third row has gradient zero: it moves matter along the beam), and costs nothing where none is required.
+    (in parallel beams the third row has gradient zero: it moves matter along them), and costs nothing where none is
+    required.
 
     `pixels`: [V] float64, edges of the views' pixels in the unit of length, which is the pixel where there are none;
     they may want gradients. A view of pixels s is one of pixels 1 by the matrix `R / s`, which shrinks areas, and not
     the mass, by s².
+
+    `sources`: [V] float64, distances R [px] of point sources, at `(0, 0, -R)` of the lab; pixels are at z = 0 (None:
+    parallel beams). The perspective is affine about each Gaussian's centre (Zwicker et al. 2001), so that a Gaussian's
+    image is wrong by about σ / R of its peak. What lies behind a source is not seen.
 
     `pixel_variance` [px²] is added to the projected covariance, mass conserved: the pixel's own, 1/12, stands
     for integration over its area (within 0.3 % for σ ≥ 1 px). The sum over pixels is the mass within 0.3 %
@@ -66,12 +72,25 @@ def splat(
         _check_raster("detector shape", shape, "two positive counts (rows, columns)", 2)
         _check_spread(cutoff, "pixel_variance", pixel_variance)
         rotations, shifts = (array.to(centres.device) for array in _check_views(rotations, shifts))
-        _check_pixels(pixels, rotations)
+        _check_lengths("pixels", "edges of pixels", pixels, rotations)
+        _check_lengths("sources", "distances of sources", sources, rotations)
     spread = _counts(shape), float(cutoff), float(pixel_variance)
-    if pixels is None:
-        return run(*cloud, rotations, shifts, *spread)
-    lines = run(*cloud, rotations / pixels[:, None, None], shifts / pixels[:, None], *spread)
-    return lines * (pixels**-2)[:, None, None, None].to(lines)
+    factors = None
+    if pixels is not None:
+        rotations, shifts = rotations / pixels[:, None, None], shifts / pixels[:, None]  # type: ignore[operator]
+        sources, factors = None if sources is None else sources / pixels, (pixels**-2)[:, None, None, None]
+    if sources is not None:
+        inclined = _obliquity(shifts, sources, shape)  # type: ignore[arg-type]
+        factors = inclined if factors is None else factors * inclined
+    lines = run(*cloud, rotations, shifts, None if sources is None else 1 / sources, *spread)
+    return lines if factors is None else lines * factors.to(lines)
+
+
+def _obliquity(shifts: Tensor, sources: Tensor, shape: tuple[int, int]) -> Tensor:
+    """How much longer rays are than their depth, [V, 1, H, W], from sources [V] to the pixels."""
+    y, x = (torch.arange(n, dtype=sources.dtype, device=sources.device) + (0.5 - n / 2) for n in shape)
+    squares = (x + shifts[:, :1])[:, None] ** 2 + ((y + shifts[:, 1:]) ** 2)[:, :, None]
+    return (1 + squares / sources[:, None, None] ** 2).sqrt()[:, None]
 
 
 def voxelise(
@@ -158,14 +177,14 @@ def _check_views(rotations: Tensor | np.ndarray, shifts: Tensor | np.ndarray) ->
     return rotations.double(), shifts.double()
 
 
-def _check_pixels(pixels: Tensor | None, rotations: Tensor) -> None:
-    """`InputError` unless there is one edge above zero for each view, or none at all."""
-    if pixels is None:
+def _check_lengths(name: str, what: str, lengths: Tensor | None, rotations: Tensor) -> None:
+    """`InputError` unless there is one length above zero for each view, or none at all."""
+    if lengths is None:
         return
-    good = pixels.dtype == torch.float64 and tuple(pixels.shape) == (len(rotations),)
-    held = (pixels.dtype, tuple(pixels.shape))
-    require(good, f"pixels must be float64, one edge for each of the {len(rotations)} views, but they are {held}.")
-    require(bool((pixels > 0).all()), "pixels must be edges above zero, but one is not; correct it.")
+    good = lengths.dtype == torch.float64 and tuple(lengths.shape) == (len(rotations),)
+    held = (lengths.dtype, tuple(lengths.shape))
+    require(good, f"{name} must be float64, one for each of the {len(rotations)} views, but they are {held}.")
+    require(bool((lengths > 0).all()), f"{name} must be {what} above zero, but one is not; correct it.")
 
 
 def _check_raster(field: str, shape: tuple[int, ...], wanted: str, dimensions: int) -> None:

@@ -5,6 +5,7 @@ Bitwise the same for every number of threads (torch's: `torch.set_num_threads`) 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from ctypes import c_void_p
 from typing import Any
 
@@ -22,13 +23,14 @@ def splat(
     amplitudes: Tensor,
     rotations: Tensor,
     shifts: Tensor,
+    curvatures: Tensor | None,
     shape: tuple[int, ...],
     cutoff: float,
     pixel_variance: float,
 ) -> Tensor:
     """Line integrals [V, C, H, W]; arguments and units as the package's `splat`, already checked."""
     options = native.Options(cutoff, pixel_variance, torch.get_num_threads())
-    poses = (rotations.contiguous(), shifts.contiguous())
+    poses = (rotations.contiguous(), shifts.contiguous(), None if curvatures is None else curvatures.contiguous())
     return _Splat.apply(centres, scales, quaternions, amplitudes, *poses, shape, options)  # type: ignore[no-any-return]
 
 
@@ -56,14 +58,16 @@ class _Splat(torch.autograd.Function):
         amplitudes: Tensor,
         rotations: Tensor,
         shifts: Tensor,
+        curvatures: Tensor | None,
         shape: tuple[int, ...],
         options: native.Options,
     ) -> Tensor:
         arrays = [a.contiguous() for a in (centres, scales, quaternions, amplitudes)]
-        ctx.save_for_backward(*arrays, rotations, shifts)
+        poses = (rotations, shifts, curvatures)
+        ctx.save_for_backward(*arrays, *poses)
         ctx.shape, ctx.options = shape, options
         image = torch.empty(len(rotations), amplitudes.shape[1], *shape)
-        native.call("holosplat_splat", _cloud(arrays), _views((rotations, shifts), shape), options, _at(image))
+        native.call("holosplat_splat", _cloud(arrays), _views(poses, shape), options, _at(image))
         return image
 
     @staticmethod
@@ -71,11 +75,12 @@ class _Splat(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         arrays, poses = ctx.saved_tensors[:4], ctx.saved_tensors[4:]
         out = [torch.empty_like(a) for a in arrays]
-        moved = [torch.empty_like(a) for a in poses] if any(ctx.needs_input_grad[4:6]) else []
-        outputs = (_gradients(out), native.ViewGradients(*(a.data_ptr() for a in moved)) if moved else None)
+        wanted = any(ctx.needs_input_grad[4:7])
+        moved = [None if a is None or not wanted else torch.empty_like(a) for a in poses]
+        outputs = (_gradients(out), native.ViewGradients(*_pointers(moved)) if wanted else None)
         views, gradient = _views(poses, ctx.shape), gradient.contiguous()
         native.call("holosplat_splat_backward", _cloud(arrays), views, ctx.options, _at(gradient), *outputs)
-        return *out, *(moved or (None, None)), None, None
+        return *out, *moved, None, None
 
 
 class _Voxelise(torch.autograd.Function):
@@ -118,5 +123,10 @@ def _gradients(arrays: list[Tensor]) -> native.Gradients:
     return native.Gradients(*(a.data_ptr() for a in arrays))
 
 
-def _views(poses: tuple[Tensor, ...], shape: tuple[int, ...]) -> native.Views:
-    return native.Views(len(poses[0]), *shape, *(a.data_ptr() for a in poses))
+def _views(poses: Sequence[Tensor | None], shape: tuple[int, ...]) -> native.Views:
+    assert poses[0] is not None
+    return native.Views(len(poses[0]), *shape, *_pointers(poses))
+
+
+def _pointers(arrays: Sequence[Tensor | None]) -> list[int | None]:
+    return [None if array is None else array.data_ptr() for array in arrays]

@@ -24,15 +24,18 @@ def splat(
     amplitudes: Tensor,
     rotations: Tensor,
     shifts: Tensor,
+    curvatures: Tensor | None,
     shape: tuple[int, ...],
     cutoff: float,
     pixel_variance: float,
 ) -> Tensor:
     """Line integrals [V, C, H, W]; arguments and units as the package's `splat`, already checked.
 
-    rotations and shifts in float64 on the device are used where they lie; from elsewhere they are copied.
+    rotations, shifts and curvatures in float64 on the device are used where they lie; from elsewhere they are copied.
     """
-    poses = tuple(a.to(centres.device, torch.float64).contiguous() for a in (rotations, shifts))
+    poses = tuple(
+        None if a is None else a.to(centres.device, torch.float64).contiguous() for a in (rotations, shifts, curvatures)
+    )
     options = (cutoff, pixel_variance)
     return _Splat.apply(centres, scales, quaternions, amplitudes, *poses, shape, options)  # type: ignore[no-any-return]
 
@@ -61,24 +64,26 @@ class _Splat(torch.autograd.Function):
         amplitudes: Tensor,
         rotations: Tensor,
         shifts: Tensor,
+        curvatures: Tensor | None,
         shape: tuple[int, ...],
         options: tuple[float, float],
     ) -> Tensor:
         cloud = tuple(a.contiguous() for a in (centres, scales, quaternions, amplitudes))
+        poses = (rotations, shifts, curvatures)
         with launching(centres):
-            image, records = triton_splat.draw(cloud, (rotations, shifts), shape, *options)
-        ctx.save_for_backward(*cloud, rotations, shifts, *records)
+            image, records = triton_splat.draw(cloud, poses, shape, *options)
+        ctx.save_for_backward(*cloud, *poses, *records)
         ctx.variance = options[1]
         return image
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        saved, of_poses = ctx.saved_tensors, any(ctx.needs_input_grad[4:6])
-        inputs = (saved[:4], saved[4:6], saved[6:], gradient.contiguous())
+        saved, of_poses = ctx.saved_tensors, any(ctx.needs_input_grad[4:7])
+        inputs = (saved[:4], saved[4:7], saved[7:], gradient.contiguous())
         with launching(gradient):
             out, moved = triton_splat.gather(*inputs, ctx.variance, of_poses)
-        return *out, *(moved or (None, None)), None, None
+        return *out, *moved, None, None
 
 
 class _Voxelise(torch.autograd.Function):

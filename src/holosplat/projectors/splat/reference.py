@@ -1,8 +1,9 @@
 """Splat and voxeliser in plain torch: the specification of the fast twins, in any float type, on any device.
 
 Formulas. The 2D covariance of a projected Gaussian is the upper-left block of the 3D one in the lab frame,
-exactly so in parallel beams (Zwicker et al. 2001, "EWA volume splatting", whose Jacobian is the identity
-here). Its line integral is the 3D mass `(2π)^{3/2} s₁s₂s₃ a` spread as a normalised 2D Gaussian.
+exactly so in parallel beams (Zwicker et al. 2001, "EWA volume splatting", whose Jacobian is the identity there;
+in a cone it is that of the perspective in the Gaussian's centre). Its line integral is the 3D mass
+`(2π)^{3/2} s₁s₂s₃ a`, times what the perspective makes of areas, spread as a normalised 2D Gaussian.
 Integration over a pixel is approximated by adding the pixel's variance to the covariance, mass conserved.
 
 Every Gaussian is drawn on the integer box that holds its cutoff ellipse. The box is found in float64 whatever
@@ -24,20 +25,25 @@ def splat(
     amplitudes: Tensor,
     rotations: Tensor,
     shifts: Tensor,
+    curvatures: Tensor | None,
     shape: tuple[int, ...],
     cutoff: float,
     pixel_variance: float,
 ) -> Tensor:
-    """Line integrals [V, C, H, W]; arguments and units as the package's `splat`, already checked."""
+    """Line integrals [V, C, H, W]; arguments and units as the package's `splat`, already checked.
+
+    curvatures: [V], one over the distances of sources (None: parallel beams); integrals along depth, not along rays.
+    """
     mass = (2 * math.pi) ** 1.5 * scales.prod(1, keepdim=True) * amplitudes
     images = [amplitudes.new_zeros((0, amplitudes.shape[1], *shape))]
-    for rotation, shift in zip(rotations, shifts):
-        mean, covariance = _projected(centres, scales, quaternions, rotation, shift)
+    bent = [None] * len(rotations) if curvatures is None else curvatures
+    for pose in zip(rotations, shifts, bent):
+        mean, covariance, area = _projected(centres, scales, quaternions, *pose)
         covariance = covariance + pixel_variance * torch.eye(2).to(covariance)
         with torch.no_grad():
-            exact = _projected(centres.double(), scales.double(), quaternions.double(), rotation, shift)
-            low, high = boxes(*exact, shape, cutoff, pixel_variance)
-        peak = mass / (2 * math.pi * torch.linalg.det(covariance).sqrt()[:, None])
+            exact = _projected(centres.double(), scales.double(), quaternions.double(), *pose)
+            low, high = boxes(*exact[:2], shape, cutoff, pixel_variance)
+        peak = area[:, None] * mass / (2 * math.pi * torch.linalg.det(covariance).sqrt()[:, None])
         images.append(_draw(mean, covariance, peak, low, high, shape)[None])
     return torch.cat(images)
 
@@ -74,12 +80,28 @@ def rotation_matrices(quaternions: Tensor) -> Tensor:
 
 
 def _projected(
-    centres: Tensor, scales: Tensor, quaternions: Tensor, rotation: Tensor, shift: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Means [N, 2] `(x, y)` from the detector's centre, and covariances [N, 2, 2], in one view [px, px²]."""
-    across = rotation[:2].to(centres)
+    centres: Tensor,
+    scales: Tensor,
+    quaternions: Tensor,
+    rotation: Tensor,
+    shift: Tensor,
+    curvature: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Means [N, 2] `(x, y)` from the detector's centre, covariances [N, 2, 2] in one view [px, px²], and what the
+    perspective makes of a unit of area [N]: `m²`, with `m = 1 / (1 + z κ)`; zero behind the source.
+
+    With `(u, v) = m (R₀ c, R₁ c)`, the map about the centre is `m (R₀ - κ u R₂)` and `m (R₁ - κ v R₂)`.
+    """
+    across, area = rotation[:2].to(centres).expand(len(centres), 2, 3), torch.ones_like(centres[:, 0])
+    seen = centres @ rotation[:2].to(centres).mT
+    if curvature is not None:
+        beam = rotation[2].to(centres)
+        depth = 1 + centres @ beam * curvature.to(centres)
+        scale = torch.where(depth > 0, 1 / depth.where(depth > 0, 1.0), 0.0)
+        seen, area = seen * scale[:, None], scale**2
+        across = scale[:, None, None] * (across - curvature.to(centres) * seen[:, :, None] * beam)
     axes = across @ (rotation_matrices(quaternions) * scales[:, None])
-    return centres @ across.mT - shift.to(centres), axes @ axes.mT
+    return seen - shift.to(centres), axes @ axes.mT, area
 
 
 def boxes(

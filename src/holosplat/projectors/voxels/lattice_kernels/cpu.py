@@ -16,7 +16,7 @@ class Kernels:
         self._images = (len(matrices), *lattice.raster)
         self._volume = lattice.shape
         self._poses = (matrices.contiguous(), shifts.contiguous())  # which must outlive the pointers
-        self._views = native.Views(*self._images, *(array.data_ptr() for array in self._poses))
+        self._views = native.Views(*self._images, *(array.data_ptr() for array in self._poses), None)
         ends = ((native.c_double * 3)(*end) for end in (lattice.origin, lattice.pitch))
         self._lattice = native.Lattice(*lattice.shape, *ends)
 
