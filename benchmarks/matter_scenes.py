@@ -43,7 +43,7 @@ from holosplat.scan import Exposures, Scan
 from holosplat.specimens import MeshScene
 from holosplat.specimens.drawn import Drawn, Substances
 from holosplat.specimens.fluids import Cuvette
-from holosplat.specimens.matter import MATTER, FieldMatter
+from holosplat.specimens.matter import MATTER, Changing, FieldMatter
 from holosplat.specimens.solids import Channel
 from holosplat.volume import Volume, Wall
 
@@ -127,8 +127,7 @@ def planned(name: str, size: str, seed: int) -> tuple[FieldMatter, Substances, D
     """The kind of a scene, what is in that which `seed` gives, the scene, and how its frames are taken."""
     pixels, count, _ = SIZES[size]
     kind = MATTER[name](MATTER[name].extent * pixels * PIXEL)
-    material, core, medium = (_delta_beta(one) for one in kind.named)
-    substances = Substances(material, None if kind.named[1] is None else core, medium)
+    substances = substances_of(kind)
     views = Views.evenly_spaced(count, shape=(pixels, pixels), pixel_size=PIXEL)
     exposures = Exposures.of(views, energy_kev=ENERGY, distance=DISTANCE)
     return kind, substances, kind.drawn(substances, seed), exposures
@@ -140,6 +139,12 @@ def scene(name: str, size: str, seed: int) -> Scene:
     is_test = np.zeros(len(exposures), dtype=bool)
     scan = hs.simulate(drawn.scene, exposures, photons_per_pixel=SIZES[size][2], seed=seed, is_test=is_test)
     return Scene(scan, substances, drawn, kind)
+
+
+def substances_of(kind: FieldMatter | Changing) -> Substances:
+    """The usual ones of a kind."""
+    material, core, medium = (_delta_beta(one) for one in kind.named)
+    return Substances(material, None if kind.named[1] is None else core, medium)
 
 
 def _delta_beta(name: str | None) -> hs.DeltaBeta:

@@ -1,4 +1,4 @@
-"""The table of other ways to reconstruct all times, from docs/data alone; `docs/figures.py` puts it into its page."""
+"""Tables of matter that moves or changes, from docs/data alone; `docs/figures.py` puts them into their page."""
 
 from __future__ import annotations
 
@@ -97,3 +97,47 @@ def assimilation() -> str:
         lines.append([r["case"], *(f"{one} ({share})" if share else one for one, share in zip(found, told)), *states])
     columns = ("assumed", "peak", "modulus", "first state, before", "after", "120 µs later")
     return markdown(columns, lines)
+
+
+@table("changing", "python benchmarks/changing.py --seeds 101 102", "an hour", "changing.csv")
+def changing() -> str:
+    """Series of matter that changes, of seeds for reporting, by the worst of their times."""
+    rows, lines = [r for r in read("changing.csv") if r["use"] == "reporting"], []
+    for name, seed in dict.fromkeys((r["series"], r["seed"]) for r in rows):
+        own = [r for r in rows if (r["series"], r["seed"]) == (name, seed)]
+        lines.append([f"{name}, {seed}", str(len(own)), *_worst(own), _events(own), _front(own), _spent(own)])
+    columns = ("series, seed", "times", "error of δ", "Dice", "total", "holes", "explained", "events told of true ones")
+    return markdown((*columns, "front, pixels", "time taken"), lines)
+
+
+def _worst(rows: list[Row]) -> list[str]:
+    """Error, Dice, total, and Dice of holes of the worst times, and how many are explained."""
+    numbers = {name: [float(r[name]) for r in rows if r[name]] for name in ("error", "dice", "total", "holes")}
+    total = "–" if _front(rows) else f"{max(numbers['total'], key=lambda one: abs(one - 1)):.3f}"
+    holes = f"{min(numbers['holes']):.2f}" if numbers["holes"] else ""
+    explained = f"{sum(r['verdict'] == 'good' for r in rows)} of {len(rows)}"
+    return [f"{max(numbers['error']):.3f}", f"{min(numbers['dice']):.3f}", total, holes, explained]
+
+
+def _events(rows: list[Row]) -> str:
+    """How many true events are told within a time, and how many others."""
+    true, told = ([r[name].split("; ") if r[name] else [] for r in rows] for name in ("true_events", "events"))
+    left, found = [list(each) for each in told], 0
+    for k, events in enumerate(true):
+        for event in events:
+            near = [n for n in (k, k - 1, k + 1) if 0 <= n < len(left) and event in left[n]]
+            found += bool(near)
+            if near:
+                left[near[0]].remove(event)
+    there, others = sum(map(len, true)), sum(map(len, left))
+    return f"{found} of {there}" + (f", {others} others" if others else "") if there + others else ""
+
+
+def _front(rows: list[Row]) -> str:
+    """By how much the radius of a front is off at most."""
+    away = [abs(float(r["radius"]) - float(r["true_radius"])) for r in rows if r["radius"]]
+    return f"{max(away):.2f}" if away else ""
+
+
+def _spent(rows: list[Row]) -> str:
+    return f"{sum(float(r['seconds']) for r in rows):.0f} s"

@@ -176,6 +176,8 @@ class MaterialPrior:
     """1 where δ of the matter lies above its medium's, -1 where it lies below, 0 where that is not known."""
     two_sided: bool = False
     """Whether δ of continuous matter may lie on both sides of its medium's."""
+    spherical: bool = False
+    """Whether continuous matter is spherical about a point that is not known, as a shock from there."""
     medium: str = ""
     """Name of the medium, as it was given."""
 
@@ -221,9 +223,14 @@ class MaterialPrior:
         require(one, "matter on both sides of its medium must be of one --material, but there are several; give one.")
         return replace(self, two_sided=True)  # type: ignore[type-var]  # every kind is a dataclass
 
+    def about_a_point(self) -> MaterialPrior:
+        """The same knowledge of continuous matter that is spherical. Errors: `InputError` for several materials."""
+        require(len(self.materials) < 2, "spherical matter must be of one material, but there are several; give one.")
+        return replace(self, spherical=True)  # type: ignore[type-var]  # every kind is a dataclass
+
     def with_ratio(self, ratio: float) -> MaterialPrior:
         """What is known of one material whose δ/β was found."""
-        return KnownRatio(float(ratio), self.sign, self.two_sided)
+        return KnownRatio(float(ratio), self.sign, self.two_sided, self.spherical)
 
     @property
     def against(self) -> str:
@@ -258,6 +265,7 @@ class MaterialPrior:
         """Plain values, ready for JSON, as config.json holds them."""
         first = self.materials[0] if self.materials else DeltaBeta(0.0, 0.0)
         told = {"sign": 0 if self.materials else self.sign, "medium": self.medium, "two_sided": self.two_sided}
+        told |= {"spherical": self.spherical}
         plain = {"kind": self.kind, "delta": first.delta, "beta": first.beta, "ratio": 0.0}
         return plain | {name: value for name, value in told.items() if value}
 
@@ -269,6 +277,7 @@ class Known(MaterialPrior):
     material: DeltaBeta
     medium: str = field(default="", compare=False)
     two_sided: bool = False
+    spherical: bool = field(default=False, repr=False)
     kind = "known"
 
     def __post_init__(self) -> None:
@@ -325,6 +334,7 @@ class KnownRatio(MaterialPrior):
     ratio: Signed
     sign: Annotated[Sign, Within(-1, 1)] = 0
     two_sided: bool = False
+    spherical: bool = field(default=False, repr=False)
     kind = "ratio"
 
     def __post_init__(self) -> None:
@@ -349,6 +359,7 @@ class Unknown(MaterialPrior):
 
     sign: Sign = 0
     two_sided: bool = False
+    spherical: bool = field(default=False, repr=False)
     kind = "free"
 
     @property

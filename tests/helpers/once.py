@@ -25,7 +25,7 @@ from holosplat.methods import Task
 from holosplat.methods.cross_validation import FirstVolumes
 from holosplat.methods.illumination import decided
 from holosplat.methods.levels import decide_matter
-from holosplat.methods.trials import BELOW, BOTH, Scoring, both_sides, decide_sides, decide_sign, with_sign
+from holosplat.methods.trials import BELOW, BOTH, SPHERICAL, Scoring, both_sides, decide_sides, decide_sign, with_sign
 from holosplat.methods.volume import material_of_levels
 from holosplat.optics.background import Light
 from holosplat.progress import Progress
@@ -97,7 +97,10 @@ def once(memory: Once) -> Iterator[None]:
             return decide_sides(replace(first, on_progress=told), *how)[1]
 
         made = memory.answer(key, compute, first.on_progress)
-        return (both_sides(first) if made.choice == BOTH else first), made
+        if made.choice not in (BOTH, SPHERICAL):
+            return first, made
+        two = both_sides(first)
+        return FirstVolumes(two.folds, with_sign(two.prior, (made,)), two.on_progress, two.options), made
 
     def ratio(scan: Scan, on_progress: Progress, *how: Any) -> float:
         return memory.answer(("ratio", *of(scan), *how), lambda told: estimate_ratio(scan, told, *how), on_progress)

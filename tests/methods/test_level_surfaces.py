@@ -11,11 +11,11 @@ import torch
 
 from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
+from holosplat.fit.smooth_volume import KnownLevels
 from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta, MaterialPrior, Matter
 from holosplat.methods import Gaussians, Task
 from holosplat.methods import first_surfaces as levels
-from holosplat.methods.ground import KnownLevels
 from holosplat.methods.surface_fit import SurfaceOptions, cut_surfaces
 from holosplat.representations import SurfaceMesh, VoxelGrid
 from holosplat.scan import Exposures, Scan

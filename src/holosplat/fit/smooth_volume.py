@@ -14,6 +14,7 @@ from torch.nn.functional import pad
 from ..backends import device, resolve
 from ..checks import require
 from ..geometry import Grid
+from ..matter import DeltaBeta
 from ..projectors.voxels import projector_for
 from ..ranges import Weight, checked_dataclass
 from .projected_gradient import direction
@@ -28,6 +29,8 @@ REFRESH = 10
 """Iterations after which the preconditioner is made anew."""
 MATTER = 0.05
 """Share of the largest value above which a voxel counts as matter for the preconditioner."""
+ALIKE = 1e-6
+"""Difference of β, as a share, below which two materials have one ratio."""
 
 
 @checked_dataclass
@@ -80,6 +83,31 @@ class ContinuousPrior:
         away = u - levels[torch.bucketize(u, 0.5 * (levels[1:] + levels[:-1]))]  # of one level all are in one bucket
         size = (away.square() + epsilon**2).sqrt()
         return size - epsilon, away / size
+
+
+@checked_dataclass
+class KnownLevels:
+    """Known materials, all of one sign of δ, in an occupancy of `unit` [δ, β]; none where no density is known."""
+
+    materials: tuple[DeltaBeta, ...]
+    unit: DeltaBeta
+
+    @property
+    def occupancies(self) -> tuple[float, ...]:
+        """The occupancy of each, rising."""
+        return tuple(sorted(delta / self.unit.delta for delta, _ in self.materials))
+
+    def absorbed(self, u: Tensor) -> Tensor | None:
+        """β beside that of an occupancy u [Z, Y, X] of the unit, as large as between the two levels that are nearest;
+        None where all matter has the unit's ratio."""
+        knots = sorted((delta / self.unit.delta, beta) for delta, beta in self.materials)
+        beside = [0.0, *(beta - level * self.unit.beta for level, beta in knots)]
+        if max(map(abs, beside)) <= ALIKE * abs(self.unit.beta):
+            return None
+        at, values = u.new_tensor([0.0, *(level for level, _ in knots)]), u.new_tensor(beside)
+        right = torch.bucketize(u, at).clamp(1, len(at) - 1)
+        share = ((u - at[right - 1]) / (at[right] - at[right - 1])).clamp(0, 1)
+        return values[right - 1] + share * (values[right] - values[right - 1])
 
 
 class VolumeProblem:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from ..checks import InputError, require
-from ..fit.loop import Fit
+from ..fit.run import Running
 from ..inference import Compared, Score
 from ..io.objects import read_object
 from ..ranges import Natural, Positive, checked_dataclass
@@ -18,7 +18,6 @@ from .auto import Auto
 from .cross_validation import predicted_frames
 from .gaussians import Gaussians, GaussianStage
 from .method import Method, Stage, Task
-from .smooth_fit import SmoothFit
 from .surface_fit import SurfaceOptions
 from .surfaces import Surfaces, SurfaceStage
 from .volume import SmoothStage, SmoothVolume
@@ -47,6 +46,7 @@ class Continued(Method):
 
     kind: ClassVar[str] = "continued"
     """It was decided by the run that it goes on from."""
+    two_sided: ClassVar[bool] = True
 
     begin: Path
     """The object file that it begins with (object.h5)."""
@@ -104,7 +104,7 @@ class ContinuedStage:
         )
         return found
 
-    def fit(self, task: Task, start: Stored) -> Fit | SmoothFit | None:
+    def fit(self, task: Task, start: Stored) -> Running | None:
         """The fit to the training frames, of few steps; None where the round before was of no use."""
         self.left.append(Score.of(task.scan.left(predicted_frames(task.scan.exposures, start))))
         gains = [Compared(self.name, *after.gain_over(before)).wins for before, after in pairwise(self.left)]

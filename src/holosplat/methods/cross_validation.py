@@ -16,7 +16,9 @@ from torch import Tensor
 from ..backends import resolve
 from ..baselines import HolographicTV, holographic_tv
 from ..baselines.algebraic import Algebraic, sirt
+from ..baselines.beyond import margins_of
 from ..baselines.holographic_tv import Correction, retrieved
+from ..fit.whitened import WhitenedFrames
 from ..geometry import Grid
 from ..matter import DeltaBeta, KnownRatio, MaterialPrior, Matter
 from ..memory import memory_kept
@@ -30,6 +32,7 @@ from ..representations import Stored, VoxelGrid
 from ..scan import Exposures, Scan
 from ..volume import Object
 from .ground import assumed_material
+from .spherical import likeliest_sphere
 
 DRAWS = 16
 """Of the noise, for what it leaves of the matter: a standard deviation by so many is right to a sixth."""
@@ -219,6 +222,10 @@ class FirstVolumes:
         if plain and self.folds.by == BY_VIEWS:
             lines = self.once("thickness", 0, self._thickness)[self.folds.kept(fold)]
         values, grid = holographic_tv(even, self.material, self._how, self.on_progress, light, lines=lines)
+        if self.prior.spherical:
+            beyond = margins_of(grid, seen.views)
+            frames = WhitenedFrames(even, self.material, light.noise, beyond=beyond)
+            values = likeliest_sphere(frames, values, self.prior.lower)
         return VoxelGrid(values[None], grid, Matter.one(*self.material)).on(resolve(self.options.backend))
 
     def _thickness(self) -> Tensor:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor, bucketize
 
 from ..backends import Backend
 from ..baselines.material import DEFAULT, MaterialEstimate, estimate_delta, estimate_ratio
@@ -44,35 +43,6 @@ def assumed_material(
     ratio = prior.ratio if isinstance(prior, KnownRatio) else estimate_ratio(scan, *how)
     delta = estimate_delta(scan, ratio, *how, prior.two_sided)
     return DeltaBeta(delta, delta / ratio)
-
-
-ALIKE = 1e-6
-"""Difference of β, as a share, below which two materials have one ratio."""
-
-
-@dataclass(frozen=True)
-class KnownLevels:
-    """Known materials, all of one sign of δ, in an occupancy of `unit` [δ, β]; none where no density is known."""
-
-    materials: tuple[DeltaBeta, ...]
-    unit: DeltaBeta
-
-    @property
-    def occupancies(self) -> tuple[float, ...]:
-        """The occupancy of each, rising."""
-        return tuple(sorted(delta / self.unit.delta for delta, _ in self.materials))
-
-    def absorbed(self, u: Tensor) -> Tensor | None:
-        """β beside that of an occupancy u [Z, Y, X] of the unit, as large as between the two levels that are nearest;
-        None where all matter has the unit's ratio."""
-        knots = sorted((delta / self.unit.delta, beta) for delta, beta in self.materials)
-        beside = [0.0, *(beta - level * self.unit.beta for level, beta in knots)]
-        if max(map(abs, beside)) <= ALIKE * abs(self.unit.beta):
-            return None
-        at, values = u.new_tensor([0.0, *(level for level, _ in knots)]), u.new_tensor(beside)
-        right = bucketize(u, at).clamp(1, len(at) - 1)
-        share = ((u - at[right - 1]) / (at[right] - at[right - 1])).clamp(0, 1)
-        return values[right - 1] + share * (values[right] - values[right - 1])
 
 
 @checked_dataclass

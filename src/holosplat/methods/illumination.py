@@ -23,6 +23,7 @@ from ..progress import Progress
 from ..representations import VoxelGrid
 from ..scan import Scan
 from .auto import Auto
+from .continued import Continued
 from .cross_validation import BY_FISSION, EFFORT, FirstVolumes, predicted_frames
 from .ground import assumed_material
 from .levels import SHOWN, TrialFits, blind
@@ -165,7 +166,8 @@ def prepared(task: Task, method: Method | None = None, before: Prepared | None =
         task.on_progress(STAGE, 0.0)
         first.taken, made = decided(first, options, told, tuple(open_to))
         if _may_have_both_sides(task, method, first):
-            first, sides = decide_sides(first, options, told)
+            spherical = isinstance(method, Auto | SmoothVolume)
+            first, sides = decide_sides(first, options, told, spherical)
             task = replace(task, prior=with_sign(task.prior, (sides,)), decisions=(*task.decisions, sides))
             if task.prior.two_sided:
                 first.taken, made = decided(first, options, told, tuple(open_to))
@@ -189,9 +191,10 @@ def prepared(task: Task, method: Method | None = None, before: Prepared | None =
 
 
 def _may_have_both_sides(task: Task, method: Method | None, first: FirstVolumes) -> bool:
-    """Whether matter may be on both sides of its medium: a known material is on one; and whether views can tell."""
+    """Whether matter may be on both sides of its medium: a known material is on one; and whether views can tell. Where
+    a method goes on from a run, that has decided."""
     told = bool(task.prior.materials) or task.prior.two_sided
-    can = method is not None and method.two_sided and not task.scan.is_series
+    can = method is not None and method.two_sided and not (task.scan.is_series or isinstance(method, Continued))
     return can and not told and first.folds.by != BY_FISSION
 
 

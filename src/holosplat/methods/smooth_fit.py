@@ -15,7 +15,7 @@ from ..baselines.beyond import Margins, margins_of
 from ..baselines.tomography import plateau
 from ..fit.loop import DivergedError
 from ..fit.run import Record, interrupts_held
-from ..fit.smooth_volume import ContinuousPrior, Descent, VolumeProblem
+from ..fit.smooth_volume import ContinuousPrior, Descent, KnownLevels, VolumeProblem
 from ..fit.whitened import WhitenedFrames
 from ..geometry import Grid
 from ..matter import DeltaBeta
@@ -26,7 +26,6 @@ from ..optics.noise import NoiseModel
 from ..optics.sampling import fringe_sampling
 from ..representations import VoxelGrid
 from ..scan import Scan
-from .ground import KnownLevels
 from .modulation import modulated, unshrunk
 
 EXPLAINED, WEAKER = 0.95, 0.98

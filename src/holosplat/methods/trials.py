@@ -5,12 +5,13 @@ these two kinds, which also explains by half a density what is in the wrong plac
 
 Of the contrast, the null is matter above its medium. Holes are taken where a volume of them predicts unseen frames
 better; matter on both sides, such as a shock and what is rarefied behind it, where this predicts them better than
-either.
+either. Few views leave so much of a volume on both sides open that it predicts others worse than one that is bound to a
+side, even where that side is wrong; the few unknowns of spherical matter they do tell.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
@@ -28,7 +29,16 @@ from ..optics.noise import NoiseModel
 from ..optics.patterns import fixed_pattern, smooth_modes
 from ..representations import Stored, VoxelGrid
 from ..scan import Scan
-from .cross_validation import EFFORT, FirstVolumes, Folds, coarse_binning, lit_by_halves, predicted_frames, predictions
+from .cross_validation import (
+    BY_FISSION,
+    EFFORT,
+    FirstVolumes,
+    Folds,
+    coarse_binning,
+    lit_by_halves,
+    predicted_frames,
+    predictions,
+)
 from .keeper import NAME, Unseen
 from .method import Method, Task, run_stages, unheard
 
@@ -294,6 +304,7 @@ def decide_kind(task: Task, method: Method, null: str, other: str) -> Decision:
 SIGN = "sign of the contrast"
 ABOVE, BELOW = "δ above the medium's", "δ below the medium's"
 BOTH = "δ on both sides of the medium's"
+SPHERICAL, BALL = f"spherical matter, {BOTH}", "spherical matter on one side of the medium"
 
 
 Scoring = Callable[[FirstVolumes, int, str], Score]
@@ -331,34 +342,61 @@ def decide_sign(first: FirstVolumes, *scores: Scoring) -> tuple[FirstVolumes, tu
     return volumes[decision.choice], (decision,)
 
 
-def decide_sides(first: FirstVolumes, light: LightOptions, told: Hypothesis = ()) -> tuple[FirstVolumes, Decision]:
-    """The first volumes of matter on one side of its medium, or on both, and the decision between them.
+def decide_sides(
+    first: FirstVolumes, light: LightOptions, told: Hypothesis = (), spherical: bool = True
+) -> tuple[FirstVolumes, Decision]:
+    """The first volumes of matter on one side of its medium, or on both, perhaps spherical, and the decision.
 
     Light makes up for matter that may not be there, and both sides for light. So both sides must predict unseen frames
     better than one, under the light that is `told` alone, and no worse than one in the light that was taken beside it:
-    where these are alike, the frames are left alone.
+    where these are alike, the frames are left alone. Spherical matter, which has the fewest unknowns, is asked for
+    before any on both sides, and must predict more than a sphere on one side. What predicts unseen views by its few
+    unknowns may yet leave much of those that it was fitted to, so it is refuted where other matter predicts the same
+    views better, their noise apart (data fission). spherical: whether it is asked for, as methods that have it do.
     """
     first.on_progress(SIGN, 0.0)
     one = ABOVE if first.prior.delta_sign > 0 else BELOW
     two = both_sides(first)
     lit, single = f"{one} in {name_of(first.taken)}", Trials(first, light)
-    trials = {one: (single, told), BOTH: (Trials(two, light), told)}
+    spheres, ball = (replace(two, prior=each.prior.about_a_point(), _made={}) for each in (two, first))
+    trials = {one: (single, told), SPHERICAL: (Trials(spheres, light), told), BOTH: (Trials(two, light), told)}
     if first.taken != told:
         trials[lit] = single, first.taken
+    if not spherical:
+        del trials[SPHERICAL]
+    rivals = {BALL: (Trials(ball, light), told)}
 
     def scored(name: str, fold: int) -> Score:
         side, without, _ = name.partition(WITHOUT)
-        tried, taken = trials[side]
+        tried, taken = (trials | rivals)[side]
         try:
             return tried.score(name_of(taken) + without, fold)
         except InputError:  # there is no such matter
             return _without_matter(first, fold)
 
-    beside, by = {BOTH: (BOTH + WITHOUT,)}, first.folds.by
+    beside, by = {SPHERICAL: (SPHERICAL + WITHOUT, BALL), BOTH: (BOTH + WITHOUT,)}, first.folds.by
     decision = select(SIGN, tuple(trials), scored, first.folds.count, by=by, beside=beside)
-    if decision.choice == BOTH:
-        return two, decision
-    return first, replace(decision, choice=one)
+    if decision.choice == SPHERICAL and _refuted({SPHERICAL: spheres, one: first, BOTH: two}, light, told):
+        return decide_sides(first, light, told, spherical=False)
+    found = {SPHERICAL: spheres, BOTH: two}.get(decision.choice)
+    return (found, decision) if found else (first, replace(decision, choice=one))
+
+
+def _refuted(volumes: Mapping[str, FirstVolumes], light: LightOptions, told: Hypothesis) -> bool:
+    """Whether other volumes than the first ones predict the same views with other noise better."""
+    tried = {}
+    for name, one in volumes.items():
+        halves = replace(one, folds=replace(one.folds, count=1, by=BY_FISSION), _made={})
+        tried[name] = Trials(halves, light)
+
+    def scored(name: str, fold: int) -> Score:
+        try:
+            return tried[name].score(name_of(told), fold)
+        except InputError:  # there is no such matter
+            return _without_matter(next(iter(volumes.values())), fold)
+
+    null = next(iter(volumes))
+    return select(SIGN, tuple(volumes), scored, by=BY_FISSION).choice != null
 
 
 def both_sides(first: FirstVolumes) -> FirstVolumes:
@@ -377,6 +415,6 @@ def with_sign(prior: MaterialPrior, decisions: Sequence[Decision]) -> MaterialPr
     """`prior` with the sign, or both, that was decided for last, if any was."""
     for each in decisions:
         if each.name == SIGN:
-            both = each.choice == BOTH
-            prior = prior.on_both_sides() if both else prior.signed(-1 if each.choice == BELOW else 1)
+            sides = {BOTH: prior.on_both_sides, SPHERICAL: prior.on_both_sides().about_a_point}.get(each.choice)
+            prior = sides() if sides else prior.signed(-1 if each.choice == BELOW else 1)
     return prior

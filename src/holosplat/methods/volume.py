@@ -25,6 +25,7 @@ from .cross_validation import predicted_frames
 from .ground import assumed_material
 from .method import Method, Stage, Task, first_of_task
 from .smooth_fit import SmoothFit, SmoothPlan
+from .spherical import SphericalFit
 
 LEFT = 0.1
 """Part of the contrast that counts as noise at least where matter leaves the frames: what is beyond explains too much.
@@ -107,12 +108,13 @@ class SmoothStage:
         light = known and known.part(torch.arange(len(task.scan)), factor)
         backend = options.volume.backend
         material = assumed_material(scan, task.prior, task.on_progress, backend, options.estimate)
-        how = replace(options.volume, upper=0.0, two_sided=task.prior.two_sided)
+        beyond = options.volume.beyond and not task.prior.spherical  # which lies in the frames
+        how = replace(options.volume, upper=0.0, two_sided=task.prior.two_sided, beyond=beyond)
         first, grid = holographic_tv(scan, material, how, task.on_progress, light)
         field = scan.views.padded(margins_of(grid, scan.views))
         return VoxelGrid(first[None], grid, Matter.one(*material)).resampled(Grid.of_views(field))
 
-    def fit(self, task: Task, start: Stored) -> SmoothFit:
+    def fit(self, task: Task, start: Stored) -> SmoothFit | SphericalFit:
         """The fit to the training frames, from larger voxels on."""
         assert isinstance(start, VoxelGrid)
         options, factor = self.options, binning(task.scan, self.options.max_voxels)
@@ -128,7 +130,10 @@ class SmoothStage:
         how = (prior, options.coarser, options.rounds, options.iterations, faint, options.loose)
         # one density as a level lost 4 % of the total of balls at 500 photons a pixel, and gained nothing
         known = task.prior.materials if len(task.prior.materials) > 1 else ()
-        return SmoothFit(SmoothPlan(scan, start, noise, task.prior.fixes_ratio, light, *how, backend, known))
+        plan = SmoothPlan(scan, start, noise, task.prior.fixes_ratio, light, *how, backend, known)
+        if task.prior.spherical:
+            return SphericalFit(plan.frames(1), start, backend, task.prior.lower)
+        return SmoothFit(plan)
 
 
 def _beside(task: Task, start: VoxelGrid) -> Scan:

@@ -16,6 +16,7 @@ from scipy.special import ndtr
 from ..bodies.rest_shape import LEAST_VOLUME, LEVEL
 from ..checks import as_written, require
 from ..geometry import Grid
+from ..inference import MARGIN
 from ..io.atomic import atomic_path
 from ..motion.track_linking import path_degree
 from ..representations import Stored
@@ -300,17 +301,19 @@ class Front:
 
 
 def _jump(places: np.ndarray, values: np.ndarray) -> float:
-    """Radius at which the radial mean of values about the middle of `places` [N, 3] jumps by most, in units of the
-    scatter of all that is farther out: a front runs into what is even."""
+    """Radius at which what is uneven farther out falls by the largest factor: a front runs into what is even.
+
+    Uneven are radial means about the middle of `places` [N, 3]: their squares about their mean, by voxels. Less than
+    `MARGIN` of all, as a part of the root, matters in practice no more.
+    """
     ring = np.linalg.norm(places, axis=1).astype(int)
     last = max(5, int(np.abs(places).max()))  # beyond it directions are missing
-    count, total, square = (np.bincount(ring, weight, last + 1)[: last + 1] for weight in (None, values, values**2))
-    mean = total / np.maximum(count, 1)
-    far = [np.cumsum(part[::-1])[::-1] for part in (count, total, square)]
-    scatter = np.sqrt(np.maximum(far[2] / far[0] - (far[1] / far[0]) ** 2, 1e-12))
-    radii = np.arange(2, last - 1)
-    inside, beyond = (np.array([mean[r + a : r + a + 2].mean() for r in radii]) for a in (-2, 1))
-    return float(radii[(np.abs(inside - beyond) * radii / scatter[radii + 1]).argmax()])
+    count, total = (np.bincount(ring, weight, last + 1)[: last + 1] for weight in (None, values))
+    squares = total**2 / np.maximum(count, 1)
+    far = [np.cumsum(part[::-1])[::-1] for part in (count, total, squares)]
+    uneven, radii = far[2] - far[1] ** 2 / far[0], np.arange(2, last - 1)
+    least = MARGIN**2 * uneven[0]
+    return float(radii[((uneven[radii - 2] + least) / (uneven[radii + 1] + least)).argmax()])
 
 
 def _fitted(places: np.ndarray, values: np.ndarray, start: np.ndarray) -> np.ndarray:

@@ -23,7 +23,7 @@ from ..methods import Method, Task
 from ..methods.continued import Continued
 from ..methods.illumination import prepared
 from ..methods.keeper import NAME, Keeper
-from ..methods.trials import decide_kind
+from ..methods.trials import decide_kind, with_sign
 from ..progress import FitProgress, FitState
 from ..representations import Stored, SurfaceMesh
 from ..scan import Scan
@@ -34,7 +34,7 @@ from ..workflows.reconstruction import Reconstruction
 from ..workflows.run_folder import RunFolder, claimed
 from .events import PARTS, Parts
 from .folder import Body, Row
-from .plan import Settings
+from .plan import Settings, prior_of
 
 PHASE = "phase.npy"
 """The phase in the first view [rad], for pages."""
@@ -218,13 +218,15 @@ def _run(
     before: Before | None = None,
     on_state: FitState | None = None,
 ) -> Reconstruction:
-    matter = settings.matter
+    matter, prior = settings.matter, shot.prior
     if before is not None:  # it was decided there
-        found = before.folder.read_summary().get("decided", {}).get("matter")
-        matter = "continuous" if found == "continuous" else "levels"
+        summary = before.folder.read_summary()
+        matter = "continuous" if summary.get("decided", {}).get("matter") == "continuous" else "levels"
+        made = [Decision.from_dict(each) for each in summary.get("decisions", ())]
+        prior = with_sign(prior_of(before.folder.read_config()["prior"]), made)
     done = reconstruct(
         shot.scan,
-        shot.prior,
+        prior,
         method,
         settings.seed,
         matter=matter,

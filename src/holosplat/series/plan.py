@@ -267,13 +267,18 @@ def prior_of(table: Mapping[str, Any]) -> MaterialPrior:
             found = (
                 MaterialPrior.unknown(sign) if kind == "free" else MaterialPrior.of_ratio(float(table["ratio"]), sign)
             )
-            return found.on_both_sides() if table.get("two_sided", False) else found
+            return _on_sides(found, table)
         require(kind == "known", f"kind must be known, ratio or free, but it is {kind!r}.")
         others = [DeltaBeta(float(delta), float(beta)) for delta, beta in table.get("others", ())]
         if "second_delta" in table:  # of version 0.2
             others.append(DeltaBeta(float(table["second_delta"]), float(table.get("second_beta", 0.0))))
         known = MaterialPrior.known(first, *others, medium=medium)
-        return known.on_both_sides() if table.get("two_sided", False) else known
+        return _on_sides(known, table)
+
+
+def _on_sides(prior: MaterialPrior, table: Mapping[str, Any]) -> MaterialPrior:
+    prior = prior.about_a_point() if table.get("spherical", False) else prior
+    return prior.on_both_sides() if table.get("two_sided", False) else prior
 
 
 WORD = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.,:+-]*")

@@ -68,10 +68,8 @@ class _Splat(torch.autograd.Function):
         shape: tuple[int, ...],
         options: tuple[float, float],
     ) -> Tensor:
-        cloud, poses = (
-            [a.contiguous() for a in (centres, scales, quaternions, amplitudes)],
-            (rotations, shifts, curvatures),
-        )
+        cloud = tuple(a.contiguous() for a in (centres, scales, quaternions, amplitudes))
+        poses = (rotations, shifts, curvatures)
         with launching(centres):
             image, records = triton_splat.draw(cloud, poses, shape, *options)
         ctx.save_for_backward(*cloud, *poses, *records)

@@ -1,0 +1,222 @@
+"""Continuous matter that is spherical, as a shock from a point: its likeliest profile over the radius, and centre."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from ..backends import resolve
+from ..fit.run import Record, interrupts_held
+from ..fit.smooth_volume import ContinuousPrior, VolumeProblem
+from ..fit.whitened import WhitenedFrames
+from ..memory import memory_kept
+from ..model import Instrument, Model
+from ..representations import VoxelGrid
+
+AXES = 3
+LEAST = 1e-12
+"""Least second derivative, as a share of the largest."""
+DAMPED, EASED, MOST_DAMPED = 1e-3, 10.0, 1e6
+"""Damping at first, as a share of each second derivative; the factor by which it falls after a step that helped and
+grows after one that did not; and the one at which the fit ends, for then no step helps."""
+WORTH = 0.5
+"""Gain of the log-likelihood below which a step is the last: by so much one of the unknowns moves it on average."""
+MOST = 30
+"""Steps at most; Gauss and Newton's take about eight."""
+
+
+class Sphere:
+    """The likeliest spherical volume, by Gauss and Newton's steps with damping (Levenberg 1944, Marquardt 1963).
+
+    Unknowns are the centre (z, y, x) in voxels and the values at the radii 0, 1, … voxels up to half the shorter side;
+    they are linear between, and 0 beyond. So few unknowns need no prior: hundreds of pixels tell each of them. In a
+    step those values are fixed at the bound `lower` that the gradient would keep there (Bertsekas 1982).
+
+    frames: in units of their noise; start [Z, Y, X]: a volume of them, whose means over spheres are where the fit
+    begins, about the point by whose reflection the frames change least (`_symmetric_about`).
+    """
+
+    def __init__(self, frames: WhitenedFrames, start: Tensor, backend: str = "cpu", lower: float = -math.inf) -> None:
+        self.problem = VolumeProblem(frames, ContinuousPrior(two_sided=True), 1.0, backend)
+        axes = [torch.arange(n, dtype=torch.float64) for n in start.shape]
+        self._places = torch.stack(torch.meshgrid(*axes, indexing="ij"))
+        rows, columns = frames.beyond
+        contrast = pad(frames.known(frames.measured - 1), (columns, columns, rows, rows))
+        count, centre = min(start.shape) // 2, _symmetric_about(self.problem.backprojection(contrast).cpu())
+        near = (self._places - centre[:, None, None, None]).norm(dim=0).round().long().clamp_max(count).flatten()
+        sums, members = (torch.zeros(count + 1, dtype=torch.float64) for _ in range(2))
+        sums.index_add_(0, near, start.double().cpu().flatten())
+        members.index_add_(0, near, torch.ones_like(near, dtype=torch.float64))
+        self.lower = torch.cat([torch.full((AXES,), -math.inf), torch.full((count,), lower)]).double()
+        self.unknowns = torch.cat([centre, (sums / members.clamp_min(1))[:count]]).maximum(self.lower)
+        self.value, self.damping, self.done = self._value(self.unknowns), DAMPED, 0
+        self.cut, self.ended = False, False
+
+    def volume(self, unknowns: Tensor | None = None) -> Tensor:
+        """The volume [Z, Y, X]."""
+        unknowns = self.unknowns if unknowns is None else unknowns
+        _, shell, part = self._shells(unknowns)
+        values = torch.cat([unknowns[AXES:], unknowns.new_zeros(2)])
+        return torch.lerp(values[shell], values[shell + 1], part).float()
+
+    def step(self) -> None:
+        """One step, if any helps; where none does for the first time, the profile is cut (`_cut`), and it goes on."""
+        level = torch.ones_like(self.unknowns)
+        level[AXES:] = float(self.unknowns[AXES:].abs().max()) or 1.0  # in smaller units rounding hides the slopes
+        changes = [one * float(unit) for one, unit in zip(self._changes(), level)]
+        seen = [self.problem.lines(self._there(one)) for one in (self.volume(), *changes)]
+        matrix, missing = (each.cpu() for each in self.problem.frames.normal_equations(seen[0], seen[1:]))
+        free = (self.unknowns > self.lower) | (missing > 0)
+        diagonal = torch.diag(matrix.diag().clamp_min(LEAST * float(matrix.diag().max())))
+        gained = 0.0
+        while self.damping < MOST_DAMPED and not gained:
+            tried = self.unknowns.clone()
+            damped = (matrix + self.damping * diagonal)[free][:, free]
+            tried[free] += level[free] * torch.linalg.solve(damped, missing[free])
+            tried = tried.maximum(self.lower)
+            value = self._value(tried)
+            self.damping *= 1 / EASED if value < self.value else EASED
+            if value < self.value:
+                gained, self.unknowns, self.value, self.done = self.value - value, tried, value, self.done + 1
+        if gained < WORTH and not self.cut:
+            self._cut(matrix + LEAST * diagonal, self.unknowns / level)
+        else:
+            self.ended = gained < WORTH or self.done >= MOST
+
+    def _cut(self, matrix: Tensor, unknowns: Tensor) -> None:
+        """Leave out the outermost values as far as the frames do not tell them from 0, by Akaike's criterion (1974): a
+        value must gain more than one of the log-likelihood. What slow changes of the profile do inside, which frames
+        hardly tell, goes with what it would be outside; a shock runs into a medium that is even.
+
+        matrix: second derivative of the misfit by the `unknowns` [K], of which without the last the misfit rises by
+        `½ x (C⁻¹) x` of their values x and their covariance C.
+        """
+        covariance, count = torch.linalg.inv(matrix), len(unknowns) - AXES
+        rise = [count * 1.0]
+        for kept in range(count - 1, 0, -1):
+            out = slice(AXES + kept, None)
+            rise.append(0.5 * float(unknowns[out] @ torch.linalg.solve(covariance[out, out], unknowns[out])) + kept)
+        kept = count - int(np.argmin(rise))
+        self.unknowns, self.lower = self.unknowns[: AXES + kept], self.lower[: AXES + kept]
+        self.value, self.damping, self.cut = self._value(self.unknowns), DAMPED, True
+
+    def _shells(self, unknowns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Radii [Z, Y, X], the last of the unknown radii below each, and how far beyond it they are."""
+        radius = (self._places - unknowns[:AXES, None, None, None]).norm(dim=0)
+        shell = radius.long().clamp_max(len(unknowns) - AXES)
+        return radius, shell, (radius - shell).clamp_max(1.0)
+
+    def _changes(self) -> list[Tensor]:
+        """Derivatives [Z, Y, X] of the volume by the unknowns."""
+        radius, shell, part = self._shells(self.unknowns)
+        values = torch.cat([self.unknowns[AXES:], self.unknowns.new_zeros(2)])
+        slope = (values[shell + 1] - values[shell]) / radius.clamp_min(0.5)
+        moved = [(slope * (centre - place)).float() for centre, place in zip(self.unknowns, self._places)]
+        hats = [((shell == n) * (1 - part) + (shell == n - 1) * part).float() for n in range(len(values) - 2)]
+        return [*moved, *hats]
+
+    def _value(self, unknowns: Tensor) -> float:
+        return self.problem.frames(self.problem.lines(self._there(self.volume(unknowns)))).value
+
+    def _there(self, volume: Tensor) -> Tensor:
+        return volume.to(self.problem.device)
+
+
+def _symmetric_about(volume: Tensor) -> Tensor:
+    """The point (z, y, x), in half voxels, about which a volume is most nearly its own reflection: half of where its
+    convolution with itself is largest. What few views smear of a sphere is as symmetric as the sphere, and so are its
+    fringes, which noise hides less than what is retrieved of them."""
+    twice = [2 * n for n in volume.shape]
+    convolved = torch.fft.irfftn(torch.fft.rfftn(volume, s=twice).square(), s=twice)
+    index = np.unravel_index(int(convolved.argmax()), convolved.shape)
+    return 0.5 * torch.tensor([float(n) for n in index], dtype=torch.float64)
+
+
+def likeliest_sphere(frames: WhitenedFrames, start: Tensor, lower: float) -> Tensor:
+    """The spherical volume [Z, Y, X] at which a `Sphere` ends."""
+    sphere = Sphere(frames, start, lower=lower)
+    while not sphere.ended:
+        sphere.step()
+    return sphere.volume().to(start)
+
+
+class SphericalFit:
+    """A spherical volume in progress, as a run asks of every fit (`fit.run`). begun: what it starts from."""
+
+    aside = 0
+    stopped_early = False
+    best_step = 0
+
+    def __init__(self, frames: WhitenedFrames, begun: VoxelGrid, backend: str, lower: float) -> None:
+        self.backend, self.step, self.seconds, self._begun = resolve(backend), 0, 0.0, begun
+        self._sphere = Sphere(frames, begun.values[0], self.backend, lower)
+
+    @property
+    def oversample(self) -> int:
+        """Wave samples a pixel."""
+        return self._sphere.problem.frames.instrument.oversample
+
+    @property
+    def finished(self) -> bool:
+        """Whether no step helps any more."""
+        return self._sphere.ended
+
+    @property
+    def share(self) -> float:
+        """How much of the work is done."""
+        return 1.0 if self.finished else self.step / MOST
+
+    @property
+    def voxels(self) -> VoxelGrid:
+        """The volume as it is now."""
+        return self._begun.with_parameters({"values": self._sphere.volume()[None]})
+
+    def result(self) -> Model:
+        """The model of the volume as it is now."""
+        exposures = self._sphere.problem.frames.train.exposures
+        return Model(self.voxels, Instrument(exposures, self.oversample, backend=self.backend))
+
+    def resolved(self) -> dict[str, Any]:
+        """What the options have become."""
+        return {"radii": len(self._sphere.unknowns) - AXES}
+
+    def columns(self) -> list[str]:
+        """Names of what a record holds."""
+        return ["step", "seconds", "loss"]
+
+    def run(self, on_record: Callable[[Record], None], until: int | None = None) -> None:
+        """Advance to the end (or to step `until`), with one record a step; Ctrl-C is passed on between two."""
+        with memory_kept(), interrupts_held() as release:
+            while not self.finished and (until is None or self.step < until):
+                started = time.perf_counter()
+                self._sphere.step()
+                self.step = self._sphere.done
+                self.seconds += time.perf_counter() - started
+                on_record({"step": self.step, "loss": self._sphere.value, "seconds": self.seconds})
+                release()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that `load` needs to go on as if nothing had happened."""
+        sphere = self._sphere
+        numbers = {"value": sphere.value, "damping": sphere.damping, "done": sphere.done}
+        return {
+            "unknowns": sphere.unknowns,
+            "seconds": self.seconds,
+            **numbers,
+            "cut": sphere.cut,
+            "ended": sphere.ended,
+        }
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Go back to a saved state."""
+        sphere, self.seconds = self._sphere, float(state["seconds"])
+        for name in ("unknowns", "value", "damping", "done", "cut", "ended"):
+            setattr(sphere, name, state[name])
+        sphere.lower, self.step = sphere.lower[: len(sphere.unknowns)], sphere.done

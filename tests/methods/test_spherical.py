@@ -1,0 +1,133 @@
+"""Spherical matter: its derivatives, a shock in three beams, and matter that is none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from holosplat.optics.noise_model import NoiseModel
+
+import holosplat as hs
+from holosplat.checks import InputError
+from holosplat.fit.whitened import WhitenedFrames
+from holosplat.geometry import Grid, Views
+from holosplat.matter import DeltaBeta, MaterialPrior
+from holosplat.methods import METHODS, SmoothVolume, Task
+from holosplat.methods.illumination import prepared
+from holosplat.methods.method import first_of_task
+from holosplat.methods.spherical import AXES, Sphere, SphericalFit
+from holosplat.methods.trials import BELOW, SPHERICAL, decide_sides, with_sign
+from holosplat.methods.volume import SmoothStage
+from holosplat.optics.background import LightOptions
+from holosplat.scan import Exposures, Scan
+from holosplat.series.plan import prior_of
+from holosplat.specimens import ExpandingShock, Substances
+from holosplat.specimens.continuous import ContinuousScene, Soft, ellipsoid
+
+WATER = DeltaBeta(5.75e-7, 2.56e-10)
+PIXEL, SHAPE, PHOTONS = 1e-6, (45, 51), 3000.0
+VIEWS = Views.from_angles([0.0, 60.0, 120.0], SHAPE, PIXEL)
+SPHERE = MaterialPrior.of_ratio(WATER.ratio).on_both_sides().about_a_point()
+PLAIN = LightOptions("even", still="none", noise="white")
+
+
+def of(scene: hs.volume.Object) -> Scan:
+    exposures = Exposures.of(VIEWS, 20.0, 0.1)
+    return hs.simulate(scene, exposures, photons_per_pixel=PHOTONS, seed=5, is_test=np.zeros(3, dtype=bool))
+
+
+@pytest.fixture(scope="module")
+def shock() -> ContinuousScene:
+    found = ExpandingShock(38e-6, shift=0.1).drawn(Substances(WATER, medium=WATER), 4).scene.at(0.7)
+    assert isinstance(found, ContinuousScene)
+    return found
+
+
+@pytest.fixture(scope="module")
+def scan(shock) -> Scan:
+    return of(shock)
+
+
+def sphere_of(scan: Scan, start: torch.Tensor) -> Sphere:
+    return Sphere(WhitenedFrames(scan, WATER, NoiseModel.white_only(torch.full((3,), 0.02), SHAPE)), start)
+
+
+def test_steps_follow_the_derivatives_of_the_volume(scan):
+    """Of centre and values, beside central differences, on a field of odd and unequal sides."""
+    sphere = sphere_of(scan, torch.zeros(SHAPE[1], *SHAPE))
+    count = len(sphere.unknowns) - AXES
+    assert count == SHAPE[0] // 2
+    values = torch.sin(torch.arange(count, dtype=torch.float64))
+    sphere.unknowns = torch.cat([torch.tensor([24.3, 21.6, 25.9], dtype=torch.float64), values])
+    for number, change in enumerate(sphere._changes()):
+        step = torch.zeros_like(sphere.unknowns)
+        step[number] = 1e-3
+        ends = [sphere.volume(sphere.unknowns + sign * step).double() for sign in (1, -1)]
+        wanted, kinks = (ends[0] - ends[1]) / 2e-3, 0.02  # radii pass from one shell to the next within a step
+        assert float(((wanted - change).abs() > 1e-3).double().mean()) < kinks
+        assert float((wanted - change).norm() / wanted.norm()) < 0.1
+
+
+def test_a_shock_is_found_in_three_beams(scan, shock):
+    """As voxels of any kind it is not: nine tenths of the field are free then."""
+    done = hs.reconstruct(scan, SPHERE, SmoothVolume(), light=PLAIN)
+    truth = shock.voxelise(Grid.of_views(VIEWS)).delta
+    found = done.object.voxelise(Grid.of_views(VIEWS)).delta
+    assert np.linalg.norm(found - truth) < 0.25 * np.linalg.norm(truth)
+    assert done.verdict is not None
+    assert done.verdict.good
+    any_kind = hs.reconstruct(scan, MaterialPrior.of_ratio(WATER.ratio).on_both_sides(), SmoothVolume(), light=PLAIN)
+    other = any_kind.object.voxelise(Grid.of_views(VIEWS)).delta
+    assert np.linalg.norm(other - truth) > 2 * np.linalg.norm(found - truth)
+
+
+def test_spherical_matter_is_taken_where_it_predicts_unseen_frames(scan):
+    """And a run that goes on keeps it."""
+    task = prepared(Task(scan, MaterialPrior.of_ratio(WATER.ratio), light=PLAIN), SmoothVolume())
+    assert task.decisions[-1].choice == SPHERICAL
+    assert task.prior.spherical
+    other = prepared(Task(scan, MaterialPrior.of_ratio(WATER.ratio), light=PLAIN), METHODS["voxels"])
+    assert not other.prior.spherical
+    assert with_sign(MaterialPrior.of_ratio(WATER.ratio), task.decisions).spherical
+    assert task.first is not None
+    before = (tuple(task.first.taken), task.decisions)
+    again = prepared(Task(scan, MaterialPrior.of_ratio(WATER.ratio), light=PLAIN), SmoothVolume(), before)
+    assert again.prior == task.prior
+
+
+@pytest.mark.parametrize(("flat", "count"), [(1.0, 2), (0.8, 1), (1.0, 1)])
+def test_matter_that_is_no_sphere_or_on_one_side_is_left_alone(flat, count):
+    """Two soft holes, one that is flattened by a fifth, and one that is a sphere of one side."""
+    first = ellipsoid(np.array([-2e-6, 1e-6, 3e-6]), (9e-6, 9e-6 * flat, 9e-6), Soft(0.3), DeltaBeta(-4e-7, -1.8e-10))
+    other = ellipsoid(np.array([9e-6, -4e-6, -2e-6]), (5e-6,) * 3, Soft(0.3), DeltaBeta(-4e-7, -1.8e-10))
+    scene = ContinuousScene((first, other)[:count])
+    holes = first_of_task(Task(of(scene), MaterialPrior.of_ratio(WATER.ratio).signed(-1)))
+    found, decision = decide_sides(holes, PLAIN)
+    assert decision.choice == BELOW
+    assert found is holes
+
+
+def test_a_fit_goes_on_where_it_was(scan):
+    task = Task(scan, SPHERE, matter="continuous", light=PLAIN)
+    stage = SmoothStage(SmoothVolume())
+    start = stage.start(task, None)
+    whole, part, rest = (stage.fit(task, start) for _ in range(3))
+    assert isinstance(whole, SphericalFit)
+    whole.run(lambda record: None)
+    part.run(lambda record: None, until=2)
+    assert not part.finished
+    rest.load(part.state_dict())
+    rest.run(lambda record: None)
+    first, second = (fit.result().object.voxelise(Grid.of_views(VIEWS)).delta for fit in (whole, rest))
+    assert np.array_equal(first, second)
+
+
+def test_what_is_told_is_kept_in_files():
+    for prior in (MaterialPrior.unknown(-1), MaterialPrior.of_ratio(900.0), MaterialPrior.known(WATER)):
+        assert prior.about_a_point().on_both_sides() == prior.on_both_sides().about_a_point() != prior.on_both_sides()
+        for told in (prior.about_a_point(), prior.about_a_point().on_both_sides()):
+            assert told.spherical
+            assert prior_of(told.as_dict()) == told
+            assert told.with_ratio(700.0).spherical
+    with pytest.raises(InputError, match="must be of one material"):
+        MaterialPrior.known(WATER, DeltaBeta(1e-7, 1e-10)).about_a_point()
