@@ -162,7 +162,8 @@ class FlowSearch:
             task = prepared(replace(self.task, scan=scan, lit=None, first=None, matter="continuous"))
             task = replace(task, prior=MaterialPrior.known(self.frames.material))
             stage = SmoothStage(self.options.volume)
-            fit: SmoothFit = stage.fit(task, stage.start(task, None))
+            fit = stage.fit(task, stage.start(task, None))
+            assert isinstance(fit, SmoothFit)  # of one known material
             fit.run(lambda record: self.task.on_progress(name, fit.share))
         self._strength = float(fit.state_dict()["strength"])
         self.prior = self.options.volume.prior.weakened(self._strength)
