@@ -22,10 +22,10 @@ from holosplat.geometry import Grid
 from holosplat.inference import Decision
 from holosplat.matter import DeltaBeta
 from holosplat.methods import Task
+from holosplat.methods.contrast import BELOW, BOTH, SPHERICAL, Scoring, both_sides, decide_sides, decide_sign, with_sign
 from holosplat.methods.cross_validation import FirstVolumes
 from holosplat.methods.illumination import decided
 from holosplat.methods.levels import decide_matter
-from holosplat.methods.trials import BELOW, BOTH, SPHERICAL, Scoring, both_sides, decide_sides, decide_sign, with_sign
 from holosplat.methods.volume import material_of_levels
 from holosplat.optics.background import Light
 from holosplat.progress import Progress

@@ -12,9 +12,10 @@ from holosplat.geometry import Grid, Views
 from holosplat.inference import Score
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import METHODS, PerView, Task
+from holosplat.methods.contrast import ABOVE, BELOW, decide_sign
+from holosplat.methods.contrast import STAGE as SIGN
 from holosplat.methods.illumination import prepared
 from holosplat.methods.method import first_of_task
-from holosplat.methods.trials import ABOVE, BELOW, SIGN, decide_sign
 from holosplat.metrics import volume_scores
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens import MeshScene, RodScene, random_bubbles

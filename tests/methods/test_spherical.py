@@ -13,10 +13,10 @@ from holosplat.fit.whitened import WhitenedFrames
 from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import METHODS, SmoothVolume, Task
+from holosplat.methods.contrast import BELOW, SPHERICAL, decide_sides, with_sign
 from holosplat.methods.illumination import prepared
 from holosplat.methods.method import first_of_task
 from holosplat.methods.spherical import AXES, Sphere, SphericalFit
-from holosplat.methods.trials import BELOW, SPHERICAL, decide_sides, with_sign
 from holosplat.methods.volume import SmoothStage
 from holosplat.optics.background import LightOptions
 from holosplat.scan import Exposures, Scan

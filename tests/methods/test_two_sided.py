@@ -16,10 +16,12 @@ from holosplat.geometry import Grid, Views
 from holosplat.inference import Score
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import METHODS, SmoothVolume, Task
+from holosplat.methods.contrast import ABOVE, BOTH, decide_sides
+from holosplat.methods.contrast import STAGE as SIGN
 from holosplat.methods.illumination import decided, prepared
 from holosplat.methods.method import first_of_task
 from holosplat.methods.start import starting_cloud
-from holosplat.methods.trials import ABOVE, BOTH, SIGN, WITHOUT, Trials, decide_sides
+from holosplat.methods.trials import WITHOUT, Trials
 from holosplat.optics.background import LightOptions
 from holosplat.optics.retrieval import RETRIEVALS, tikhonov
 from holosplat.scan import Exposures, Scan

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import torch
@@ -85,7 +85,7 @@ class ContinuousPrior:
         return size - epsilon, away / size
 
 
-@checked_dataclass
+@dataclass(frozen=True)
 class KnownLevels:
     """Known materials, all of one sign of δ, in an occupancy of `unit` [δ, β]; none where no density is known."""
 

@@ -24,26 +24,13 @@ from ..representations import VoxelGrid
 from ..scan import Scan
 from .auto import Auto
 from .continued import Continued
+from .contrast import STAGE as SIGN
+from .contrast import Scoring, decide_sides, decide_sign, with_sign
 from .cross_validation import BY_FISSION, EFFORT, FirstVolumes, predicted_frames
 from .ground import assumed_material
 from .levels import SHOWN, TrialFits, blind
 from .method import Method, Task, first_of_task
-from .trials import (
-    SIGN,
-    UNEVEN,
-    WITHOUT,
-    Hypothesis,
-    Scoring,
-    Trials,
-    decide_sides,
-    decide_sign,
-    name_of,
-    named,
-    plain_light,
-    rivals,
-    with_more,
-    with_sign,
-)
+from .trials import UNEVEN, WITHOUT, Hypothesis, Trials, name_of, named, plain_light, rivals, with_more
 from .volume import SmoothVolume
 
 STAGE = "light and noise"

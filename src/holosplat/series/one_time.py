@@ -21,9 +21,10 @@ from ..io.guard import read_array
 from ..matter import MaterialPrior
 from ..methods import Method, Task
 from ..methods.continued import Continued
+from ..methods.contrast import with_sign
 from ..methods.illumination import prepared
 from ..methods.keeper import NAME, Keeper
-from ..methods.trials import decide_kind, with_sign
+from ..methods.trials import decide_kind
 from ..progress import FitProgress, FitState
 from ..representations import Stored, SurfaceMesh
 from ..scan import Scan

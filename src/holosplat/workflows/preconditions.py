@@ -12,10 +12,10 @@ from ..checks import as_written, require
 from ..inference import Decision
 from ..io.provenance import sha256
 from ..methods import Task
+from ..methods.contrast import STAGE as SIGN
 from ..methods.illumination import STAGE, Prepared
 from ..methods.levels import SHOWN
 from ..methods.presets import SCHEMA
-from ..methods.trials import SIGN
 from ..methods.uncertain import Uncertain
 from ..optics.background import LightOptions
 from ..scan import Scan
