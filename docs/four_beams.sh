@@ -48,8 +48,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from holosplat.align.changes import moved_onto
-from holosplat.align.changes import changes
+from holosplat.align.derivatives import changes, moved_onto
 from holosplat.io import read_beams, read_scan
 
 files = [read_scan(f"true{n}.nxs").exposures for n in (1, 2, 3, 4)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from holosplat.optics.noise_model import NoiseModel
+from holosplat.optics.noise import NoiseModel
 
 import holosplat as hs
 from holosplat.checks import InputError
