@@ -35,7 +35,7 @@ MOST = 30
 class Sphere:
     """The likeliest spherical volume, by Gauss and Newton's steps with damping (Levenberg 1944, Marquardt 1963).
 
-    Unknowns are the centre (z, y, x) in voxels and the values at the radii 0, 1, … voxels up to half the shorter side;
+    Unknowns are the centre (z, y, x) in voxels and the values at the radii 0, 1, … voxels below half the shorter side;
     they are linear between, and 0 beyond. So few unknowns need no prior: hundreds of pixels tell each of them. In a
     step those values are fixed at the bound `lower` that the gradient would keep there (Bertsekas 1982).
 
@@ -49,7 +49,7 @@ class Sphere:
         self._places = torch.stack(torch.meshgrid(*axes, indexing="ij"))
         rows, columns = frames.beyond
         contrast = pad(frames.known(frames.measured - 1), (columns, columns, rows, rows))
-        count, centre = min(start.shape) // 2, _symmetric_about(self.problem.backprojection(contrast).cpu())
+        count, centre = max(1, min(start.shape) // 2), _symmetric_about(self.problem.backprojection(contrast).cpu())
         near = (self._places - centre[:, None, None, None]).norm(dim=0).round().long().clamp_max(count).flatten()
         sums, members = (torch.zeros(count + 1, dtype=torch.float64) for _ in range(2))
         sums.index_add_(0, near, start.double().cpu().flatten())
