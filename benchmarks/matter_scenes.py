@@ -218,6 +218,7 @@ def main() -> None:
         for size in options.sizes
         for how in options.runs
         for kind in options.kinds
+        if how != "wall told" or issubclass(MATTER[kind], Cuvette | Channel)
     ]
     for kind, size, how, seed in wanted if not options.summary else ():
         there = {(row.kind, row.size, row.run, row.seed) for row in rows_of(options.out)}
