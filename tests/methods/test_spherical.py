@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from holosplat.optics.noise import NoiseModel
 
 import holosplat as hs
 from holosplat.checks import InputError
@@ -19,6 +18,7 @@ from holosplat.methods.method import first_of_task
 from holosplat.methods.spherical import AXES, Sphere, SphericalFit
 from holosplat.methods.volume import SmoothStage
 from holosplat.optics.background import LightOptions
+from holosplat.optics.noise import NoiseModel
 from holosplat.scan import Exposures, Scan
 from holosplat.series.plan import prior_of
 from holosplat.specimens import ExpandingShock, Substances
