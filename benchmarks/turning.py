@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 
 import holosplat as hs
 from holosplat.geometry import Grid, Views, rotation_y
-from holosplat.io.half_acquisition import heightened
+from holosplat.io.larger_frames import heightened
 from holosplat.methods import METHODS
 from holosplat.metrics import volume_scores
 
