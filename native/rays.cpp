@@ -16,6 +16,7 @@ namespace {
 constexpr int64_t kLanes = 128;      // rays that are followed together: their voxels are neighbours
 constexpr int64_t kLevel = 8;        // rays of one row, at least, that are followed along it
 constexpr int64_t kTogether = 1024;  // rays of a task
+constexpr int64_t kTurns = 16;       // parts of a block whose rays are cast back in turns
 
 struct Block {  // of up to kLanes rays, what is missing being the first one again, without weight
   float row[kLanes], row_step[kLanes], column[kLanes], column_step[kLanes], weight[kLanes];
@@ -159,10 +160,16 @@ void cast_back(const Block& b, const HoloRays& rays, const float* image, float d
   if (b.level) {
     const Level at = meet_level(b, rays, depth, p);
     std::fill(line + at.low, line + at.high + 1, 0.0f);
+    float left[kLanes], right[kLanes];
     for (int64_t n = 0; n < b.count; ++n) {
-      const float value = image[b.first + n] * b.weight[n], right = value * p.right[n];
-      line[p.column[n]] += value - right, line[p.column[n] + 1] += right;
+      const float value = image[b.first + n] * b.weight[n];
+      right[n] = value * p.right[n], left[n] = value - right[n];
     }
+    // Neighbouring rays share voxels, and each would wait for the one before: rays of kTurns parts take turns.
+    const int64_t part = (b.count + kTurns - 1) / kTurns;
+    for (int64_t m = 0; m < part; ++m)
+      for (int64_t n = m; n < b.count; n += part)
+        line[p.column[n]] += left[n], line[p.column[n] + 1] += right[n];
     float *upper = slice + at.row * w, *lower = upper + w;
     for (int64_t j = at.low; j <= at.high; ++j) {
       const float below = at.down * line[j];
