@@ -124,8 +124,11 @@ First = Callable[[Task], Sequence[Way]]
 explain these frames badly."""
 
 
-def coarse_surfaces(task: Task, first: First, surfaces: SurfaceOptions, how: CoarseToFine) -> SurfaceMesh | None:
-    """Surfaces near to those of the frames of `task`, by frames on coarser pixels; None where these do not show them.
+def coarse_surfaces(
+    task: Task, first: First, surfaces: SurfaceOptions, how: CoarseToFine, poor: list[SurfaceMesh] | None = None
+) -> SurfaceMesh | None:
+    """Surfaces near to those of the frames of `task`, by frames on coarser pixels; None where these do not show them,
+    or what they show explains the frames badly: it then joins `poor`.
 
     Small frames (`how.factor`) are their own coarse ones. The matter is one of a known level.
     """
@@ -145,7 +148,11 @@ def coarse_surfaces(task: Task, first: First, surfaces: SurfaceOptions, how: Coa
     if unexplained(found, task.scan, surfaces) <= most:
         return found
     found = _run(replace(task, freedom=None), found, how.nearby(surfaces.fit, found))  # edges may be off by more
-    return found if unexplained(found, task.scan, surfaces) <= most else None
+    if unexplained(found, task.scan, surfaces) <= most:
+        return found
+    if poor is not None:
+        poor.append(found)
+    return None
 
 
 def last_steps(task: Task, found: SurfaceMesh, surfaces: SurfaceOptions, how: CoarseToFine) -> SurfaceMesh:

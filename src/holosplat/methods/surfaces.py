@@ -90,26 +90,36 @@ class BodiesStage(GaussianStage):
         return self.near_surfaces(task, surfaces) if straight or not self._small(task) else None
 
     def best_cut(self, task: Task, cloud: GaussianCloud, cut: Callable[[], SurfaceMesh]) -> SurfaceMesh:
-        """The surfaces that `cut` gets out of `cloud`; but of small noisy frames that this explains badly, such as
-        have taken turns with a volume, if they explain more by the policy of `select`.
+        """The surfaces that `cut` gets out of `cloud`; but of small frames those of a first volume, if they explain more
+        by the policy of `select`. In noise only where Gaussians explain the frames badly are there any.
 
         Errors: those of `cut`, where there are no others.
         """
-        how = self.options.coarse
-        alone = not (self._small(task) and self._straight(task) and task.bounded and is_noisy(task, self.options))
-        if alone or self._missing(cloud, task) <= how.missing_matter:
-            return cut()
+        alone = not (self._small(task) and self._straight(task) and task.bounded)
         seen = self._without_validation(task)
-        other = begun_surfaces(seen, lambda at: surfaces_of_volume(at, self.options, self.surfaces), self.surfaces, how)
+        other = None if alone else self._of_first_volume(task, cloud)
         if other is None:
             return cut()
         try:
-            own = settled(seen, cut(), self.surfaces, how.of_views(len(seen.scan.train())))
+            how = self.options.coarse.of_views(len(seen.scan.train()))
+            own = settled(seen, cut(), self.surfaces, how)
         except InputError:  # Gaussians hold no surface
             return other
         found = {"of Gaussians": own, "of a volume": other}
         decision = select("surfaces", tuple(found), lambda name, _: self._score(found[name], seen), by=BY)
         return found[decision.choice]
+
+    def _of_first_volume(self, task: Task, cloud: GaussianCloud) -> SurfaceMesh | None:
+        """Those that Gaussians were begun without, for they explain the frames badly; in noise, of a volume in turns."""
+        how = self.options.coarse
+        if not is_noisy(task, self.options):
+            if not self.poor:  # of a run that was resumed
+                self.near_surfaces(task, self.surfaces)
+            return self.poor[-1] if self.poor else None
+        if self._missing(cloud, task) <= how.missing_matter:
+            return None
+        seen = self._without_validation(task)
+        return begun_surfaces(seen, lambda at: surfaces_of_volume(at, self.options, self.surfaces), self.surfaces, how)
 
     def _score(self, found: SurfaceMesh, task: Task) -> Score:
         return Score.of(task.scan.left(frames_of(found, task.scan, self.surfaces.fit).double()))
