@@ -90,8 +90,8 @@ class BodiesStage(GaussianStage):
         return self.near_surfaces(task, surfaces) if straight or not self._small(task) else None
 
     def best_cut(self, task: Task, cloud: GaussianCloud, cut: Callable[[], SurfaceMesh]) -> SurfaceMesh:
-        """The surfaces that `cut` gets out of `cloud`; but of small frames those of a first volume, if they explain more
-        by the policy of `select`. In noise only where Gaussians explain the frames badly are there any.
+        """The surfaces that `cut` gets out of `cloud`; but of small frames those of a first volume, where there are any
+        and they explain more by the policy of `select`.
 
         Errors: those of `cut`, where there are no others.
         """
@@ -110,7 +110,8 @@ class BodiesStage(GaussianStage):
         return found[decision.choice]
 
     def _of_first_volume(self, task: Task, cloud: GaussianCloud) -> SurfaceMesh | None:
-        """Those that Gaussians were begun without, for they explain the frames badly; in noise, of a volume in turns."""
+        """Surfaces without which Gaussians began, as they explain the frames badly; in noise, where Gaussians do, those
+        that have taken turns with a volume."""
         how = self.options.coarse
         if not is_noisy(task, self.options):
             if not self.poor:  # of a run that was resumed
