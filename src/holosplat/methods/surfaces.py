@@ -116,7 +116,7 @@ class BodiesStage(GaussianStage):
         if not is_noisy(task, self.options):
             if not self.poor:  # of a run that was resumed
                 self.near_surfaces(task, self.surfaces)
-            return self.poor[-1] if self.poor else None
+            return self.poor[-1]
         if self._missing(cloud, task) <= how.missing_matter:
             return None
         seen = self._without_validation(task)
@@ -209,4 +209,4 @@ def _by_coarse_pixels(cloud: Stored, task: Task, stage: SurfaceStage) -> Surface
         found = extract_surfaces(cloud, coarse.scan, stage.options.extraction)
         return on_pixels(found, coarse.scan.views.finest, math.inf)
 
-    return coarse_surfaces(task, first, stage.options, stage.coarse)
+    return coarse_surfaces(task, first, stage.options, stage.coarse)[0]
