@@ -144,10 +144,3 @@ def test_a_solver_goes_on_from_a_coarser_one():
         errors.append(float((solver.volume - end.volume).norm() / end.volume.norm()))
     assert warm.bounds == (0.0, 1.0)
     assert errors[0] < 0.9 * errors[1]
-    inside = torch.zeros(coarse.volume.shape, dtype=torch.bool)
-    inside[:, :, 3:] = True
-    coarse.keep_inside(inside)
-    bounded = coarse.on_finer(fine, 2, 0.4)
-    bounded.run(images, 1)
-    assert not bounded.volume[:, :, :6].any()
-    assert bounded.volume[:, :, 6:].any()

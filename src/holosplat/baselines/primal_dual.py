@@ -89,9 +89,8 @@ class PrimalDual:
     def on_finer(self, projector: LinearProjector, factor: int, weight: float) -> PrimalDual:
         """A solver on voxels and pixels `factor` times finer, those of `projector`, which goes on from this one.
 
-        It takes over the volume (interpolated), the bounds, where it may have matter, and the dual of total variation,
-        without which its first iterations would blur what is there; the residuals' dual starts anew, and with all
-        frequencies trusted alike.
+        It takes over the volume (interpolated), the bounds, and the dual of total variation, without which its first
+        iterations would blur what is there; the residuals' dual starts anew, and with all frequencies trusted alike.
         """
         volume, dual = self.volume, self._gradient_dual
         if factor > 1:
@@ -101,11 +100,6 @@ class PrimalDual:
         lower, upper = self.bounds
         finer = PrimalDual(projector, volume, weight, upper, self.coupling / factor**2, self._backend, lower)
         finer._gradient_dual.copy_(dual * factor**2)
-        if self._inside is not None:
-            inside = self.projector.volume_out(self._inside)
-            for axis in (0, 1, 2):
-                inside = inside.repeat_interleave(factor, axis)
-            finer.keep_inside(inside)
         return finer
 
     def discount(self, spectrum: Tensor) -> None:
