@@ -255,8 +255,7 @@ class Wall:
 
     def voxelise(self, grid: Grid) -> Volume:
         """δ and β, by the share of each voxel that lies in the wall and in the hollow."""
-        parts = zip(self._parts, self._shares(grid))
-        total = sum(added[:, None, None] * share for (_, added), share in parts)
+        total = np.tensordot(np.stack([added for _, added in self._parts], axis=1), np.stack(self._shares(grid)), 1)
         delta, beta = (np.broadcast_to(part[:, None], grid.shape) for part in total)
         return Volume(delta, beta, grid)
 
