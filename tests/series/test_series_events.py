@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -124,6 +125,15 @@ def test_a_front_is_found_with_radius_step_and_errors():
     assert abs(found.radius - 8.3 * 0.5e-6) < 4 * found.errors[3]
     with pytest.raises(InputError, match="a front needs matter"):
         Front.of(Volume(np.zeros(GRID.shape), np.zeros(GRID.shape), GRID))
+
+
+def test_what_hardly_anything_is_far_out_is_no_front():
+    """A shell of a thousandth of the step, beyond which there is nothing at all."""
+    faint = shock(8.3)
+    z, y, x = np.meshgrid(*(np.arange(n) - 0.5 * (n - 1) for n in GRID.shape), indexing="ij")
+    shell = np.abs(np.sqrt((x - 1) ** 2 + (y + 2) ** 2 + (z - 0.5) ** 2) - 12) < 0.5
+    found = Front.of(replace(faint, delta=faint.delta + 1e-3 * DELTA * shell))
+    assert found.radius == pytest.approx(8.3 * 0.5e-6, abs=0.1 * 0.5e-6)
 
 
 def test_a_front_runs_at_a_speed_with_its_error():
