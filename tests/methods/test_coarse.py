@@ -239,7 +239,11 @@ def test_small_bodies_beside_a_large_one_are_not_lost():
     """What coarse pixels do not show is in the fine structure of the frames, which then start on their own pixels."""
     specks = [bumpy(2, 1.6, centre, depth=0.0) for centre in np.random.default_rng(2).uniform(-24, 24, (60, 3))]
     task = task_of(scan_of(body(12.0), *specks))
-    assert GaussianStage(quick()).coarse_surfaces(task, SurfaceOptions()) is None
+    stage = GaussianStage(quick())
+    assert stage.coarse_surfaces(task, SurfaceOptions()) is None
+    (poor,) = stage.poor  # the large body alone
+    assert poor is not None
+    assert unexplained(poor, task.scan, SurfaceOptions()) > quick().coarse.missing
 
 
 def test_a_run_goes_on_from_a_near_start_with_as_few_steps(scan, near, tmp_path, monkeypatch, unjudged_runs):

@@ -167,10 +167,35 @@ def test_gaussians_without_a_surface_give_way(noisy, monkeypatch):
         stage.best_cut(noisy, cloud, none)
 
 
-def test_frames_without_much_noise_ask_nothing(monkeypatch):
+@pytest.mark.parametrize(("poor", "cut"), [(4, 2), (2, 4)], ids=["of the volume", "of Gaussians"])
+def test_of_the_surfaces_of_clean_frames_those_that_explain_more_are_taken(poor, cut, monkeypatch):
+    """Gaussians that began because surfaces explained the frames badly may explain them worse: then these are taken."""
     monkeypatch.setattr("holosplat.methods.surfaces.missing_matter", lambda *given: pytest.fail("not asked for"))
+    monkeypatch.setattr(BodiesStage, "near_surfaces", lambda *given: pytest.fail("they are there"))
     clean = task_of(1e7)
-    assert best_cut(clean, 1)[1] == 1
+    stage, cloud = BodiesStage(OPTIONS, surfaces=HOW, poor=[mesh_of(poor)]), cloud_of_surfaces(mesh_of(cut), clean)
+    assert len(stage.best_cut(clean, cloud, lambda: mesh_of(cut)).faces) == len(mesh_of().faces)
+
+
+def test_where_first_surfaces_explained_clean_frames_there_are_no_others(monkeypatch):
+    monkeypatch.setattr(BodiesStage, "near_surfaces", lambda *given: pytest.fail("it was asked"))
+    clean = task_of(1e7)
+    stage, cloud = BodiesStage(OPTIONS, surfaces=HOW, poor=[None]), cloud_of_surfaces(mesh_of(2), clean)
+    assert torch.equal(stage.best_cut(clean, cloud, lambda: mesh_of(2)).vertices, mesh_of(2).vertices)
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_a_resumed_run_of_clean_frames_makes_its_first_surfaces_anew(there, monkeypatch):
+    def near(stage: BodiesStage, task: Task, surfaces: SurfaceOptions) -> None:
+        stage.poor.append(mesh_of(4) if there else None)
+
+    monkeypatch.setattr(BodiesStage, "near_surfaces", near)
+    found, _ = best_cut(task_of(1e7), 2)
+    assert len(found.faces) == len(mesh_of(4 if there else 2).faces)
+
+
+def test_surfaces_of_a_random_start_have_no_rivals(monkeypatch):
+    monkeypatch.setattr("holosplat.methods.surfaces.missing_matter", lambda *given: pytest.fail("not asked for"))
     at_random = replace(OPTIONS, start="random")
     assert best_cut(task_of(2000.0), 1, at_random)[1] == 1
 

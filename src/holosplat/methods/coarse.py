@@ -124,8 +124,11 @@ First = Callable[[Task], Sequence[Way]]
 explain these frames badly."""
 
 
-def coarse_surfaces(task: Task, first: First, surfaces: SurfaceOptions, how: CoarseToFine) -> SurfaceMesh | None:
+def coarse_surfaces(
+    task: Task, first: First, surfaces: SurfaceOptions, how: CoarseToFine
+) -> tuple[SurfaceMesh | None, SurfaceMesh | None]:
     """Surfaces near to those of the frames of `task`, by frames on coarser pixels; None where these do not show them.
+    And such as are not near, for they explain the frames badly; None where there are none.
 
     Small frames (`how.factor`) are their own coarse ones. The matter is one of a known level.
     """
@@ -137,15 +140,16 @@ def coarse_surfaces(task: Task, first: First, surfaces: SurfaceOptions, how: Coa
         found = first_of(coarse, first(coarse), surfaces, how)
         factor //= 2
     if found is None:
-        return None
+        return None, None
     while factor > 1:
         found = _fitted(binned(task, factor), found, surfaces, how)
         factor //= 2
     found = on_pixels(found, task.scan.views.finest, how.last_edge)
-    if unexplained(found, task.scan, surfaces) <= most:
-        return found
-    found = _run(replace(task, freedom=None), found, how.nearby(surfaces.fit, found))  # edges may be off by more
-    return found if unexplained(found, task.scan, surfaces) <= most else None
+    if unexplained(found, task.scan, surfaces) > most:
+        found = _run(replace(task, freedom=None), found, how.nearby(surfaces.fit, found))  # edges may be off by more
+        if unexplained(found, task.scan, surfaces) > most:
+            return None, found
+    return found, None
 
 
 def last_steps(task: Task, found: SurfaceMesh, surfaces: SurfaceOptions, how: CoarseToFine) -> SurfaceMesh:

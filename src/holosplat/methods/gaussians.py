@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
@@ -87,6 +87,8 @@ class GaussianStage:
 
     options: Gaussians
     name: str = "fit"
+    poor: list[SurfaceMesh | None] = field(default_factory=list, compare=False, repr=False)
+    """What `near_surfaces` gave up, as it explained the frames badly; None where there was nothing."""
 
     def start(self, task: Task, before: Stored | None) -> Stored | Near:
         """What the fit begins with; of small frames where a network is asked, what it is without one, or its guess."""
@@ -172,7 +174,9 @@ class GaussianStage:
                 return ways
             return ways_of_guess(coarse, ways, options, surfaces, self._fitted)
 
-        return coarse_surfaces(self._without_validation(task), first, surfaces, how)
+        found, poor = coarse_surfaces(self._without_validation(task), first, surfaces, how)
+        self.poor.append(poor)
+        return found
 
     def solved(self, task: Task) -> GaussianCloud:
         """The cloud fitted to the frames of `task`."""

@@ -90,26 +90,37 @@ class BodiesStage(GaussianStage):
         return self.near_surfaces(task, surfaces) if straight or not self._small(task) else None
 
     def best_cut(self, task: Task, cloud: GaussianCloud, cut: Callable[[], SurfaceMesh]) -> SurfaceMesh:
-        """The surfaces that `cut` gets out of `cloud`; but of small noisy frames that this explains badly, such as
-        have taken turns with a volume, if they explain more by the policy of `select`.
+        """The surfaces that `cut` gets out of `cloud`; but of small frames those of a first volume, where there are any
+        and they explain more by the policy of `select`.
 
         Errors: those of `cut`, where there are no others.
         """
-        how = self.options.coarse
-        alone = not (self._small(task) and self._straight(task) and task.bounded and is_noisy(task, self.options))
-        if alone or self._missing(cloud, task) <= how.missing_matter:
-            return cut()
+        alone = not (self._small(task) and self._straight(task) and task.bounded)
         seen = self._without_validation(task)
-        other = begun_surfaces(seen, lambda at: surfaces_of_volume(at, self.options, self.surfaces), self.surfaces, how)
+        other = None if alone else self._of_first_volume(task, cloud)
         if other is None:
             return cut()
         try:
-            own = settled(seen, cut(), self.surfaces, how.of_views(len(seen.scan.train())))
+            how = self.options.coarse.of_views(len(seen.scan.train()))
+            own = settled(seen, cut(), self.surfaces, how)
         except InputError:  # Gaussians hold no surface
             return other
         found = {"of Gaussians": own, "of a volume": other}
         decision = select("surfaces", tuple(found), lambda name, _: self._score(found[name], seen), by=BY)
         return found[decision.choice]
+
+    def _of_first_volume(self, task: Task, cloud: GaussianCloud) -> SurfaceMesh | None:
+        """Surfaces without which Gaussians began, as they explain the frames badly; in noise, where Gaussians do, those
+        that have taken turns with a volume."""
+        how = self.options.coarse
+        if not is_noisy(task, self.options):
+            if not self.poor:  # of a run that was resumed
+                self.near_surfaces(task, self.surfaces)
+            return self.poor[-1]
+        if self._missing(cloud, task) <= how.missing_matter:
+            return None
+        seen = self._without_validation(task)
+        return begun_surfaces(seen, lambda at: surfaces_of_volume(at, self.options, self.surfaces), self.surfaces, how)
 
     def _score(self, found: SurfaceMesh, task: Task) -> Score:
         return Score.of(task.scan.left(frames_of(found, task.scan, self.surfaces.fit).double()))
@@ -198,4 +209,4 @@ def _by_coarse_pixels(cloud: Stored, task: Task, stage: SurfaceStage) -> Surface
         found = extract_surfaces(cloud, coarse.scan, stage.options.extraction)
         return on_pixels(found, coarse.scan.views.finest, math.inf)
 
-    return coarse_surfaces(task, first, stage.options, stage.coarse)
+    return coarse_surfaces(task, first, stage.options, stage.coarse)[0]
