@@ -68,6 +68,33 @@ def test_steps_follow_the_derivatives_of_the_volume(scan):
         assert float((wanted - change).norm() / wanted.norm()) < 0.1
 
 
+def test_a_total_that_is_told_counts_by_its_error(scan, shock):
+    """Frames tell the total of a profile badly: a sure one is taken, and one that is not sure changes nothing."""
+    truth = torch.from_numpy(shock.voxelise(Grid.of_views(VIEWS)).delta / WATER.delta).float()
+    whitened = WhitenedFrames(scan, WATER, NoiseModel.white_only(torch.full((3,), PHOTONS**-0.5), SHAPE))
+    sums = list[float]()
+    for told in (None, (300.0, 1e6), (300.0, 1e-2)):
+        sphere = Sphere(whitened, truth, told=told)
+        while not sphere.ended:
+            sphere.step()
+        sums.append(float(sphere.volume().double().sum()))
+    error = Sphere(whitened, truth).error_of_sum
+    assert sums[1] == pytest.approx(sums[0], abs=0.05 * error)
+    assert sums[2] == pytest.approx(300.0, abs=0.1)
+    assert abs(sums[0] - float(truth.double().sum())) < 4 * error
+    assert error > 50 > 10 * Sphere(whitened, truth, told=(300.0, 5.0)).error_of_sum / 2
+
+
+def test_a_total_is_told_of_spherical_matter_alone(scan):
+    task = Task(scan, MaterialPrior.of_ratio(WATER.ratio).on_both_sides(), matter="continuous", light=PLAIN)
+    stage = SmoothStage(SmoothVolume(told=(0.0, 1e-24)))
+    with pytest.raises(InputError, match="told is of spherical matter"):
+        stage.fit(task, stage.start(task, None))
+    for told in ((1.0,), (1.0, 0.0)):
+        with pytest.raises(InputError, match="told must be a total and its positive standard error"):
+            SmoothVolume(told=told)
+
+
 def test_a_shock_is_found_in_three_beams(scan, shock):
     """As voxels of any kind it is not: nine tenths of the field are free then."""
     done = hs.reconstruct(scan, SPHERE, SmoothVolume(), light=PLAIN)
@@ -76,6 +103,9 @@ def test_a_shock_is_found_in_three_beams(scan, shock):
     assert np.linalg.norm(found - truth) < 0.25 * np.linalg.norm(truth)
     assert done.verdict is not None
     assert done.verdict.good
+    assert done.total is not None
+    assert done.total.error is not None
+    assert abs(done.total.held - float(truth.sum()) * PIXEL**3) < 4 * done.total.error
     any_kind = hs.reconstruct(scan, MaterialPrior.of_ratio(WATER.ratio).on_both_sides(), SmoothVolume(), light=PLAIN)
     other = any_kind.object.voxelise(Grid.of_views(VIEWS)).delta
     assert np.linalg.norm(other - truth) > 2 * np.linalg.norm(found - truth)

@@ -123,7 +123,8 @@ class BodiesStage(GaussianStage):
             found["on finer voxels"] = settled(seen, cut(self.surfaces.extraction.finer()), self.surfaces, steps)
         found = {"of Gaussians": own, **found}
         decision = select("surfaces", tuple(found), lambda name, _: self._score(found[name], seen), by=BY)
-        return found[decision.choice]
+        alone = decision.choice == "of Gaussians" and "of a volume" not in found
+        return first if alone else found[decision.choice]
 
     def _score(self, found: SurfaceMesh, task: Task) -> Score:
         return Score.of(task.scan.left(frames_of(found, task.scan, self.surfaces.fit).double()))
