@@ -165,7 +165,8 @@ def retry_time(
             other.path.rename(folder.path)
     if done is None:
         return replace(own.row, **said)
-    return _written(shot, settings, folder, done, replace(shot.row, **said), began)
+    row = _written(shot, settings, folder, done, replace(shot.row, **said), began)
+    return replace(row, seconds=round(own.row.seconds + row.seconds, 3))
 
 
 def common_totals(rows: Sequence[Row]) -> dict[int, Told]:
