@@ -284,7 +284,7 @@ def _run(
 
 
 def _known(before: Before) -> MaterialPrior:
-    """What is known of the matter of a finished time, and was decided of its sides."""
+    """The prior of a finished time, with the sides of the medium that were decided."""
     made = [Decision.from_dict(each) for each in before.folder.read_summary().get("decisions", ())]
     return with_sign(prior_of(before.folder.read_config()["prior"]), made)
 
