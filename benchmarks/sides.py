@@ -80,9 +80,10 @@ def run(family: str, seed: int, scan: hs.Scan, prior: hs.MaterialPrior) -> Row:
     choice = SPHERICAL if task.prior.spherical else sides[-1].choice if sides else ""
     found = gains.get(SPHERICAL)
     numbers = ("", "") if found is None else (f"{found.gain:.4f}", f"{found.error:.4f}")
-    count, (rows, columns) = len(task.scan), task.scan.views.shape
+    frames = " × ".join(map(str, (len(task.scan), *task.scan.views.shape)))
+    made_on = "yes" if family == SHOCK else "no"
     return Row(
-        *(family, seed, "yes" if family == SHOCK else "no", choice, *numbers, f"{count} × {rows} × {columns}"),
+        *(family, seed, made_on, choice, numbers[0], numbers[1], frames),
         *(round(seconds, 1), round(without, 1), machine(), commit()),
     )
 

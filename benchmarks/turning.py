@@ -4,9 +4,10 @@
 
 Cells of water at 20 keV and 0.05 m, on pixels of 1 µm, with 3000 photons a pixel: `helix` has 48 frames of 40 rows over
 540 degrees, in which the object moves by 60 rows, beside a planar scan of 19 views of 100 rows, as many photons in all;
-`laminography` has 24 views of 48 × 64 pixels about an axis that leans by 30 degrees, beside one that does not. Errors
-of the helix are of the 60 rows that half a turn sees. `aligned_px` is what is left of random shifts of one pixel (rms)
-after `align`, with 20,000 photons, without what moves the object; lost views, more than 2 pixels off, count in `lost`.
+`laminography` has 24 views of 48 × 64 pixels about an axis that leans by 30 degrees, beside one that does not; of
+`planar, odd` there are 23, no two of them opposite. Errors of the helix are of the 60 rows that half a turn sees.
+`aligned_px` is what is left of random shifts of one pixel (rms) after `align`, with 20,000 photons, without what moves
+the object; lost views, more than 2 pixels off, count in `lost`.
 Meshes are simulated exactly, which no reconstruction does.
 """
 
@@ -26,13 +27,13 @@ from scipy.spatial.transform import Rotation
 
 import holosplat as hs
 from holosplat.geometry import Grid, Views, rotation_y
-from holosplat.io.half_acquisition import heightened
+from holosplat.io.larger_frames import heightened
 from holosplat.methods import METHODS
 from holosplat.metrics import volume_scores
 
 PAGE = Path(__file__).resolve().parents[1] / "docs/data/turning.csv"
 PIXEL, LEANS = 1e-6, 30.0
-KINDS = ("helix", "planar, tall", "laminography", "planar")
+KINDS = ("helix", "planar, tall", "laminography", "planar", "planar, odd")
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,8 @@ def views_of(kind: str) -> Views:
         rows = np.round(60 * (part - 0.5)) * PIXEL
         return replace(Views.from_angles(540 * part, (40, 48), PIXEL), shifts=np.stack([0 * rows, rows], 1))
     lean = Rotation.from_euler("x", LEANS if kind == "laminography" else 0.0, degrees=True).as_matrix()
-    return Views.from_rotations(lean @ rotation_y(np.arange(24) * 15.0), (48, 64), PIXEL)
+    count = 23 if kind == "planar, odd" else 24
+    return Views.from_rotations(lean @ rotation_y(np.arange(count) * 360.0 / count), (48, 64), PIXEL)
 
 
 def run(kind: str, method: str, seed: int) -> Row:

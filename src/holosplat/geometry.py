@@ -258,7 +258,7 @@ class Poses:
     scales: [V] float64, pixel sizes over `pitch`, as in `Views`; None where all are one.
     sources: [V] float64, distances of sources [m], as in `Views`; None for parallel beams.
 
-    Rotations, shifts and scales may require gradients, which projections then give them.
+    Rotations, shifts, scales and sources may require gradients, which projections then give them.
     """
 
     rotations: torch.Tensor
@@ -284,9 +284,9 @@ class Poses:
 
     @property
     def requires_grad(self) -> bool:
-        """Whether gradients of the rotations, of the shifts or of the scales are asked for."""
-        scales = self.scales is not None and self.scales.requires_grad
-        return self.rotations.requires_grad or self.shifts.requires_grad or scales
+        """Whether gradients of any of the arrays are asked for."""
+        arrays = (self.rotations, self.shifts, self.scales, self.sources)
+        return any(each is not None and each.requires_grad for each in arrays)
 
     @property
     def matrices(self) -> torch.Tensor:

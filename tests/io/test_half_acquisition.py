@@ -12,7 +12,7 @@ from holosplat.baselines import TOMOGRAPHIES
 from holosplat.beamline.simulate import simulate
 from holosplat.geometry import Grid, Views, rotation_y
 from holosplat.io.formats import read_as
-from holosplat.io.half_acquisition import stitched
+from holosplat.io.larger_frames import stitched
 from holosplat.io.nxtomo import write_scan
 from holosplat.io.reading import Reading
 from holosplat.materials import parse_material

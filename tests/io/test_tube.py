@@ -8,7 +8,7 @@ import pytest
 from holosplat.checks import InputError
 from holosplat.geometry import Views, rotation_tilted
 from holosplat.io.formats import read_as
-from holosplat.io.half_acquisition import Tube
+from holosplat.io.larger_frames import Tube
 from holosplat.io.nxtomo import write_scan
 from holosplat.io.reading import Part, Reading, Told
 from holosplat.scan import Exposures, Scan

@@ -15,12 +15,12 @@ from holosplat.beamline.simulate import simulate
 from holosplat.geometry import Views
 from holosplat.inference import Score
 from holosplat.matter import DeltaBeta, MaterialPrior
-from holosplat.methods import Auto, SmoothVolume, Task
+from holosplat.methods import Auto, SmoothVolume, Task, trials
 from holosplat.methods.cross_validation import BY_FISSION, BY_VIEWS, FirstVolumes, Folds
 from holosplat.methods.illumination import STAGE, prepared, shows_matter
 from holosplat.methods.levels import SHOWN
 from holosplat.methods.method import first_of_task
-from holosplat.methods.trials import UNEVEN, WITHOUT, Trials, plain_light, with_more
+from holosplat.methods.trials import NULL, UNEVEN, WITHOUT, Trials, plain_light, with_more
 from holosplat.optics.background import FLUX, Background, Light, LightOptions
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.red_cells import random_cells
@@ -215,6 +215,23 @@ def test_grain_of_each_frame_is_no_pattern(sharp):
     task = prepared(Task(lit(sharp, grain), PRIOR))
     assert task.lit is not None
     assert task.lit.still is None
+
+
+def test_light_that_the_frames_of_a_later_fold_do_not_show_adds_nothing_there(sharp, monkeypatch):
+    """As where the views that show air are set aside there; a run ended there before."""
+    first = first_of_task(Task(lit(sharp, uneven()), PRIOR))
+    hidden, found = first.folds.split(1)[0].frames, trials.with_more
+
+    def where_air_is_seen(light, one, seen, *given):
+        unseen = one == UNEVEN and np.array_equal(seen.frames, hidden)
+        return None if unseen else found(light, one, seen, *given)
+
+    monkeypatch.setattr(trials, "with_more", where_air_is_seen)
+    tried = Trials(first, LightOptions())
+    assert tried.proposed((UNEVEN,))
+    here, there = (tried.score(UNEVEN, fold).gain_over(tried.score(NULL, fold))[0] for fold in (0, 1))
+    assert here > 0
+    assert there == 0
 
 
 def test_what_is_told_is_not_decided(soft):

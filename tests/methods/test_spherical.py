@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -11,8 +13,8 @@ from holosplat.checks import InputError
 from holosplat.fit.whitened import WhitenedFrames
 from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta, MaterialPrior
-from holosplat.methods import METHODS, SmoothVolume, Task
-from holosplat.methods.contrast import BELOW, SPHERICAL, decide_sides, with_sign
+from holosplat.methods import METHODS, SmoothVolume, Task, contrast
+from holosplat.methods.contrast import BELOW, BOTH, SPHERICAL, _refuted, both_sides, decide_sides, with_sign
 from holosplat.methods.illumination import prepared
 from holosplat.methods.method import first_of_task
 from holosplat.methods.spherical import AXES, Sphere, SphericalFit
@@ -135,6 +137,36 @@ def test_a_shock_is_found_in_two_beams(shock):
 
 
 @pytest.mark.parametrize("angles", [(0.0, 60.0, 120.0), (0.0, 90.0), (0.0,)], ids=["3 views", "2 views", "1 view"])
+def test_radii_beyond_the_front_are_left_out(scan):
+    """Of 22 values, those that frames do not tell from 0; the front is at some 15 voxels."""
+    task = Task(scan, SPHERE, matter="continuous", light=PLAIN)
+    stage = SmoothStage(SmoothVolume())
+    fit = stage.fit(task, stage.start(task, None))
+    fit.run(lambda record: None)
+    assert isinstance(fit, SphericalFit)
+    assert 13 <= fit.resolved()["radii"] <= 18
+    values = fit.voxels.values[0]
+    away = (fit._sphere._places - fit._sphere.unknowns[:AXES, None, None, None]).norm(dim=0)
+    assert not values[away > 19].any()
+    assert values[away < 13].any()
+
+
+def test_what_other_matter_predicts_better_from_the_same_views_is_refuted(scan, monkeypatch):
+    """Not a shock; but two holes that are taken for one sphere. What is refuted is not taken."""
+    prior = MaterialPrior.of_ratio(WATER.ratio)
+    lumps = [
+        ellipsoid(1e-6 * np.array(at), (6e-6,) * 3, Soft(0.3), DeltaBeta(-4e-7, -1.8e-10))
+        for at in ([-8, 1, 3], [9, -4, -2])
+    ]
+    for given, refuted in ((scan, False), (of(ContinuousScene(tuple(lumps))), True)):
+        first = first_of_task(Task(given, prior.signed(-1)))
+        two = both_sides(first)
+        sphere = replace(two, prior=two.prior.about_a_point(), _made={})
+        assert _refuted({SPHERICAL: sphere, BELOW: first, BOTH: two}, PLAIN, ()) is refuted
+    monkeypatch.setattr(contrast, "_refuted", lambda *_: True)
+    assert decide_sides(first_of_task(Task(scan, prior)), PLAIN)[1].choice != SPHERICAL
+
+
 @pytest.mark.parametrize(("flat", "count"), [(1.0, 2), (0.8, 1), (1.0, 1)])
 def test_matter_that_is_no_sphere_or_on_one_side_is_left_alone(flat, count, angles):
     """Two soft holes, one that is flattened by a fifth, and one that is a sphere of one side."""

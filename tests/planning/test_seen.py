@@ -139,7 +139,7 @@ def test_a_range_is_said_in_words():
 
 @pytest.mark.parametrize("column", [11.5, 7.5, 13.25])
 def test_frames_half_a_turn_apart_are_mirrored_about_the_right_axis(column):
-    """Of a bump 3 columns from the axis; none of three views without such a pair."""
+    """Of a bump 3 columns from the axis; none of three views without such a pair, or of other heights."""
     columns, rows = np.arange(24), np.arange(20)[:, None]
     bumps = [1 - 0.2 * np.exp(-((columns - column - off) ** 2 + (rows - 9) ** 2) / 12) for off in (3, 1, -3)]
     frames = np.stack(bumps).astype(np.float32)
@@ -149,3 +149,5 @@ def test_frames_half_a_turn_apart_are_mirrored_about_the_right_axis(column):
     assert beside is not None
     assert beside < 0.6
     assert opposite_likeness(Views.from_angles([0, 60, 120], (20, 24), 1e-6), frames) is None
+    risen = replace(views, shifts=np.array([[0, 0], [0, 5e-6], [0, 10e-6]]))
+    assert opposite_likeness(risen.about_column(column), frames) is None  # of a helix: frames of other heights

@@ -24,16 +24,6 @@ NEEDED = [(True, True), (True, False), (False, True)]
 """Which of rotations and shifts require gradients."""
 
 
-@pytest.fixture(params=["cpu", "cuda"])
-def fast(request, monkeypatch) -> tuple[str, torch.device]:
-    """A fast backend and its device: the GPU's is Triton's interpreter where there is none."""
-    if request.param == "cpu":
-        return "cpu", torch.device("cpu")
-    device = request.getfixturevalue("gpu")
-    few_programs(monkeypatch, device)
-    return "cuda", device
-
-
 def of_kind(kind: str, channels: int = 1, count: int = 120) -> list[Tensor]:
     """Float32 clouds; beside those of `cloud`, far below a pixel, and needles 40 times as long as thick."""
     if kind not in ("tiny", "elongated"):

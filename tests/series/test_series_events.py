@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -135,6 +136,15 @@ def test_the_front_of_a_thin_shell_is_not_drawn_inside(share):
     kind = ExpandingShock(44e-6)
     found = Front.of(kind.drawn(Substances(water, medium=water), 1).scene.at(share).voxelise(grid))
     assert found.radius == pytest.approx(kind.radius(share), abs=0.1e-6)
+
+
+def test_what_hardly_anything_is_far_out_is_no_front():
+    """A shell of a thousandth of the step, beyond which there is nothing at all."""
+    faint = shock(8.3)
+    z, y, x = np.meshgrid(*(np.arange(n) - 0.5 * (n - 1) for n in GRID.shape), indexing="ij")
+    shell = np.abs(np.sqrt((x - 1) ** 2 + (y + 2) ** 2 + (z - 0.5) ** 2) - 12) < 0.5
+    found = Front.of(replace(faint, delta=faint.delta + 1e-3 * DELTA * shell))
+    assert found.radius == pytest.approx(8.3 * 0.5e-6, abs=0.1 * 0.5e-6)
 
 
 def test_a_front_runs_at_a_speed_with_its_error():

@@ -128,7 +128,7 @@ def align(
     from ..align import AlignedBeams, align_views, find_axis
     from ..io.atomic import require_writable
     from ..io.formats import read_frames
-    from ..io.half_acquisition import heightened, of_parts
+    from ..io.larger_frames import heightened, of_parts
     from ..io.nxtomo import write_scan
     from ..planning.acts import of_alignment
     from ..scan import Scan

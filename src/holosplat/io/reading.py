@@ -267,12 +267,12 @@ class Reading:
         """
         scan = self.told.placed(scan)
         if joined:
-            from .half_acquisition import heightened, stitched  # SciPy, without which help is printed
+            from .larger_frames import heightened, stitched  # SciPy, without which help is printed
 
             scan = heightened(stitched(scan))
         tell_views(scan)
         if self.told.tube is not None:
-            from .half_acquisition import Tube
+            from .larger_frames import Tube
 
             scan = Tube.parsed(self.told.tube).taken_out_of(scan)
         if (said := self.told.wall) is not None:

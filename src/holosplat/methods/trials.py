@@ -140,8 +140,13 @@ class Trials:
         return self.tried(named(plain), fold).of(expected).score(light)
 
     def _light(self, hypothesis: Hypothesis, fold: int) -> Light | None:
-        """What a hypothesis says of the fitted frames, by the volume without its last part; None where it cannot be."""
-        return self._first.once(("light of", hypothesis), fold, lambda: self._found(hypothesis, fold))
+        """What a hypothesis says of the fitted frames, by the volume without its last part.
+
+        None where it says nothing of those of the first fold, for which it is proposed; of a later fold it then adds
+        nothing.
+        """
+        found = self._first.once(("light of", hypothesis), fold, lambda: self._found(hypothesis, fold))
+        return self._light(hypothesis[:-1], fold) if found is None and fold else found
 
     def _found(self, hypothesis: Hypothesis, fold: int) -> Light | None:
         if not hypothesis:

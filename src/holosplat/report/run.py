@@ -187,6 +187,8 @@ def _summary(reconstruction: Reconstruction, scan: Scan, moving: Moving | None) 
     exposures, views = scan.exposures, scan.views
     h, w = views.shape
     distance = f"{span(100 * exposures.distance)} cm behind the sample" if exposures.distance.any() else "in contact"
+    if views.sources is not None:
+        distance += f", in cones of a source {span(1e3 * views.sources)} mm before it"
     state = "" if reconstruction.finished else " The fit was interrupted before its end."
     if moving is not None:
         state += f" Volumes, slices and projections are those at {1e6 * _middle(moving):.4g} µs."

@@ -160,18 +160,15 @@ def _in_bands(
 ) -> Tensor:
     """What `method` retrieves of frames as large as their `bands` of rows, beyond which it is as in the outermost ones.
 
-    Rows without any value say nothing, so that such a frame is a smaller one (`io.half_acquisition.heightened`).
+    Rows without any value say nothing, so that such a frame is a smaller one (`io.larger_frames.heightened`).
     """
     found, counts = torch.empty_like(frames), bands[:, 1] - bands[:, 0]
     for count in np.unique(counts):
         some = np.flatnonzero(counts == count)
         rows = torch.from_numpy(bands[some, 0][:, None] + np.arange(count)).to(frames.device)
         at = torch.from_numpy(some).to(frames.device)[:, None]
-        part = exposures[some]
-        views, (h, w) = part.views, frames.shape[1:]
-        moved = (0.5 * (bands[some].sum(1) - h)) * views.pixel_sizes
-        shifts = views.shifts + np.stack([np.zeros(len(some)), moved], 1)
-        part = replace(part, views=replace(views, shape=(int(count), w), shifts=shifts))
+        part, (h, w) = exposures[some], frames.shape[1:]
+        part = replace(part, views=replace(part.views, shape=(int(count), w)))  # where they lie plays no part
         gaps = missing[at, rows]
         band = method(frames[at, rows], part, missing=gaps if gaps.any() else None)
         nearest = (torch.arange(h, device=frames.device) - rows[:, :1]).clamp(0, int(count) - 1)
