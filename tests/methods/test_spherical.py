@@ -136,7 +136,6 @@ def test_a_shock_is_found_in_two_beams(shock):
     assert np.linalg.norm(done.object.voxelise(Grid.of_views(VIEWS)).delta - truth) < 0.25 * np.linalg.norm(truth)
 
 
-@pytest.mark.parametrize("angles", [(0.0, 60.0, 120.0), (0.0, 90.0), (0.0,)], ids=["3 views", "2 views", "1 view"])
 def test_radii_beyond_the_front_are_left_out(scan):
     """Of 22 values, those that frames do not tell from 0; the front is at some 15 voxels."""
     task = Task(scan, SPHERE, matter="continuous", light=PLAIN)
@@ -167,6 +166,7 @@ def test_what_other_matter_predicts_better_from_the_same_views_is_refuted(scan, 
     assert decide_sides(first_of_task(Task(scan, prior)), PLAIN)[1].choice != SPHERICAL
 
 
+@pytest.mark.parametrize("angles", [(0.0, 60.0, 120.0), (0.0, 90.0), (0.0,)], ids=["3 views", "2 views", "1 view"])
 @pytest.mark.parametrize(("flat", "count"), [(1.0, 2), (0.8, 1), (1.0, 1)])
 def test_matter_that_is_no_sphere_or_on_one_side_is_left_alone(flat, count, angles):
     """Two soft holes, one that is flattened by a fifth, and one that is a sphere of one side."""
