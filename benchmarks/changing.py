@@ -1,6 +1,6 @@
 """Matter that changes: series of `simulate --specimen`, time by time; rows of docs/data/changing.csv.
 
-    python benchmarks/changing.py --seeds 101                       # all series: two hours on one core
+    python benchmarks/changing.py --seeds 101                       # all series: three hours on one core
     python benchmarks/changing.py --series merging-drops --pixels 48 --seeds 1 --folder runs
     python benchmarks/changing.py --summary                         # the worst time of each series that is there
 
@@ -54,6 +54,8 @@ SERIES: dict[str, tuple[str, int, tuple[float, ...]]] = {
     "merging-drops": ("merging-drops", 10, EVEN4),
     "collapse": ("collapse", 12, EVEN4),
     "expanding-shock": ("expanding-shock", 8, EVEN4),
+    "expanding-shock, 2 views": ("expanding-shock", 8, (0.0, 90.0)),
+    "expanding-shock, 1 view": ("expanding-shock", 8, (0.0,)),
     "crushed-lattice": ("crushed-lattice", 6, EVEN8),
     "merging-drops, 3 beams": ("merging-drops", 10, (0.0, 30.0, 48.0)),
     "pinching-jet": ("pinching-jet", 10, EVEN4),

@@ -11,11 +11,13 @@ import pytest
 
 from holosplat.checks import InputError
 from holosplat.geometry import Grid
+from holosplat.materials import parse_material
 from holosplat.matter import Matter
 from holosplat.representations import VoxelGrid
 from holosplat.series.collect import collect
 from holosplat.series.events import FRONT_COLUMNS, PARTS, Front, History, Parts, front_rows
 from holosplat.series.folder import SeriesFolder
+from holosplat.specimens import ExpandingShock, Substances
 from holosplat.volume import Volume
 
 GRID = Grid.centred((31, 25, 37), 0.5e-6, (1e-6, 0.0, 0.0))
@@ -125,6 +127,15 @@ def test_a_front_is_found_with_radius_step_and_errors():
     assert abs(found.radius - 8.3 * 0.5e-6) < 4 * found.errors[3]
     with pytest.raises(InputError, match="a front needs matter"):
         Front.of(Volume(np.zeros(GRID.shape), np.zeros(GRID.shape), GRID))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5], ids=["thin", "thicker"])
+def test_the_front_of_a_thin_shell_is_not_drawn_inside(share):
+    """What a young shock compresses is thinner than the fitted shell, and falls off in a curve behind the front."""
+    water, grid = parse_material("water").delta_beta(20.0), Grid.centred((44, 45, 46), 1e-6)
+    kind = ExpandingShock(44e-6)
+    found = Front.of(kind.drawn(Substances(water, medium=water), 1).scene.at(share).voxelise(grid))
+    assert found.radius == pytest.approx(kind.radius(share), abs=0.1e-6)
 
 
 def test_what_hardly_anything_is_far_out_is_no_front():

@@ -178,7 +178,8 @@ def misfit_spectrum(rays: Rays, misfit: Tensor) -> Tensor:
 
 def plateau(occupancy: Tensor) -> float:
     """The level [units of `occupancy`] that most of the matter has: the mass-weighted median of [Z, Y, X] ≥ 0."""
-    values = occupancy[occupancy > 0].sort().values
+    values = occupancy[occupancy > 0]
+    values = torch.from_numpy(np.sort(values.numpy())) if values.device.type == "cpu" else values.sort().values
     if not len(values):
         raise NoMatterError
     mass = values.double().cumsum(0)

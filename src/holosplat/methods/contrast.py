@@ -72,7 +72,8 @@ def decide_sides(
     where these are alike, the frames are left alone. Spherical matter, which has the fewest unknowns, is asked for
     before any on both sides, and must predict more than a sphere on one side. What predicts unseen views by its few
     unknowns may yet leave much of those that it was fitted to, so it is refuted where other matter predicts the same
-    views better, their noise apart (data fission). spherical: whether it is asked for, as methods that have it do.
+    views better, their noise apart (data fission). spherical: whether it is asked for, as methods that have it do. Of
+    one view or two, none is unseen, and what is free on both sides is not asked for, but may refute what is spherical.
     """
     first.on_progress(STAGE, 0.0)
     one = ABOVE if first.prior.delta_sign > 0 else BELOW
@@ -84,6 +85,8 @@ def decide_sides(
         trials[lit] = single, first.taken
     if not spherical:
         del trials[SPHERICAL]
+    if first.folds.by == BY_FISSION:
+        del trials[BOTH]
     rivals = {BALL: (Trials(ball, light), told)}
 
     def scored(name: str, fold: int) -> Score:

@@ -152,8 +152,8 @@ def prepared(task: Task, method: Method | None = None, before: Prepared | None =
     if before is None:
         task.on_progress(STAGE, 0.0)
         first.taken, made = decided(first, options, told, tuple(open_to))
-        if _may_have_both_sides(task, method, first):
-            spherical = isinstance(method, Auto | SmoothVolume)
+        spherical = isinstance(method, Auto | SmoothVolume)
+        if _may_have_both_sides(task, method) and (spherical or first.folds.by != BY_FISSION):
             first, sides = decide_sides(first, options, told, spherical)
             task = replace(task, prior=with_sign(task.prior, (sides,)), decisions=(*task.decisions, sides))
             if task.prior.two_sided:
@@ -177,12 +177,12 @@ def prepared(task: Task, method: Method | None = None, before: Prepared | None =
     return replace(task, scan=scan, lit=light, decisions=(*task.decisions, *made), first=first)
 
 
-def _may_have_both_sides(task: Task, method: Method | None, first: FirstVolumes) -> bool:
-    """Whether matter may be on both sides of its medium: a known material is on one; and whether views can tell. Where
-    a method goes on from a run, that has decided."""
+def _may_have_both_sides(task: Task, method: Method | None) -> bool:
+    """Whether matter may be on both sides of its medium: a known material is on one. Where a method goes on from a run,
+    that has decided."""
     told = bool(task.prior.materials) or task.prior.two_sided
     can = method is not None and method.two_sided and not (task.scan.is_series or isinstance(method, Continued))
-    return can and not told and first.folds.by != BY_FISSION
+    return can and not told
 
 
 def _scores(options: LightOptions) -> list[Scoring]:

@@ -40,10 +40,19 @@ class Sphere:
     step those values are fixed at the bound `lower` that the gradient would keep there (Bertsekas 1982).
 
     frames: in units of their noise; start [Z, Y, X]: a volume of them, whose means over spheres are where the fit
-    begins, about the point by whose reflection the frames change least (`_symmetric_about`).
+    begins, about the point by whose reflection the frames change least (`_symmetric_about`); told: what the sum of the
+    volume is, and the standard error of that, where something else than frames tells it.
     """
 
-    def __init__(self, frames: WhitenedFrames, start: Tensor, backend: str = "cpu", lower: float = -math.inf) -> None:
+    def __init__(
+        self,
+        frames: WhitenedFrames,
+        start: Tensor,
+        backend: str = "cpu",
+        lower: float = -math.inf,
+        told: tuple[float, float] | None = None,
+    ) -> None:
+        self.told = told
         self.problem = VolumeProblem(frames, ContinuousPrior(two_sided=True), 1.0, backend)
         axes = [torch.arange(n, dtype=torch.float64) for n in start.shape]
         self._places = torch.stack(torch.meshgrid(*axes, indexing="ij"))
@@ -68,11 +77,7 @@ class Sphere:
 
     def step(self) -> None:
         """One step, if any helps; where none does for the first time, the profile is cut (`_cut`), and it goes on."""
-        level = torch.ones_like(self.unknowns)
-        level[AXES:] = float(self.unknowns[AXES:].abs().max()) or 1.0  # in smaller units rounding hides the slopes
-        changes = [one * float(unit) for one, unit in zip(self._changes(), level)]
-        seen = [self.problem.lines(self._there(one)) for one in (self.volume(), *changes)]
-        matrix, missing = (each.cpu() for each in self.problem.frames.normal_equations(seen[0], seen[1:]))
+        level, matrix, missing, _ = self._equations()
         free = (self.unknowns > self.lower) | (missing > 0)
         diagonal = torch.diag(matrix.diag().clamp_min(LEAST * float(matrix.diag().max())))
         gained = 0.0
@@ -89,6 +94,30 @@ class Sphere:
             self._cut(matrix + LEAST * diagonal, self.unknowns / level)
         else:
             self.ended = gained < WORTH or self.done >= MOST
+
+    @property
+    def error_of_sum(self) -> float:
+        """Standard error of the sum of the volume, of which no value is unknown beyond the last one that is not 0:
+        large, for frames hardly tell slow changes of the profile."""
+        _, matrix, _, sums = self._equations()
+        last = AXES + 1 + int(self.unknowns[AXES:].nonzero().max())
+        matrix, sums = matrix[:last, :last], sums[:last]
+        inverse = torch.linalg.inv(matrix + LEAST * torch.diag(matrix.diag().clamp_min(float(matrix.diag().max()))))
+        return math.sqrt(float(sums @ inverse @ sums))
+
+    def _equations(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Units of the unknowns, and in these the second derivatives, minus the gradient, and the slopes of the sum."""
+        level = torch.ones_like(self.unknowns)
+        level[AXES:] = float(self.unknowns[AXES:].abs().max()) or 1.0  # in smaller units rounding hides the slopes
+        changes = [one * float(unit) for one, unit in zip(self._changes(), level)]
+        seen = [self.problem.lines(self._there(one)) for one in (self.volume(), *changes)]
+        matrix, missing = (each.cpu() for each in self.problem.frames.normal_equations(seen[0], seen[1:]))
+        sums = torch.stack([one.double().sum() for one in changes])
+        if self.told:
+            value, error = self.told
+            matrix = matrix + torch.outer(sums, sums) / error**2
+            missing = missing + sums * (value - float(self.volume().double().sum())) / error**2
+        return level, matrix, missing, sums
 
     def _cut(self, matrix: Tensor, unknowns: Tensor) -> None:
         """Leave out the outermost values as far as the frames do not tell them from 0, by Akaike's criterion (1974): a
@@ -123,7 +152,10 @@ class Sphere:
         return [*moved, *hats]
 
     def _value(self, unknowns: Tensor) -> float:
-        return self.problem.frames(self.problem.lines(self._there(self.volume(unknowns)))).value
+        volume = self.volume(unknowns)
+        misfit = self.problem.frames(self.problem.lines(self._there(volume))).value
+        away = (float(volume.double().sum()) - self.told[0]) / self.told[1] if self.told else 0.0
+        return misfit + 0.5 * away**2
 
     def _there(self, volume: Tensor) -> Tensor:
         return volume.to(self.problem.device)
@@ -148,15 +180,20 @@ def likeliest_sphere(frames: WhitenedFrames, start: Tensor, lower: float) -> Ten
 
 
 class SphericalFit:
-    """A spherical volume in progress, as a run asks of every fit (`fit.run`). begun: what it starts from."""
+    """A spherical volume in progress, as a run asks of every fit (`fit.run`). begun: what it starts from; told: its
+    total δ and the standard error of that [m³], where something else than frames tells them."""
 
     aside = 0
     stopped_early = False
     best_step = 0
 
-    def __init__(self, frames: WhitenedFrames, begun: VoxelGrid, backend: str, lower: float) -> None:
+    def __init__(
+        self, frames: WhitenedFrames, begun: VoxelGrid, backend: str, lower: float, told: tuple[float, ...] = ()
+    ) -> None:
         self.backend, self.step, self.seconds, self._begun = resolve(backend), 0, 0.0, begun
-        self._sphere = Sphere(frames, begun.values[0], self.backend, lower)
+        self._unit = math.prod(begun.grid.voxel_size) * begun.matter.delta
+        known = (told[0] / self._unit, told[1] / abs(self._unit)) if told else None
+        self._sphere = Sphere(frames, begun.values[0], self.backend, lower, known)
 
     @property
     def oversample(self) -> int:
@@ -172,6 +209,11 @@ class SphericalFit:
     def share(self) -> float:
         """How much of the work is done."""
         return 1.0 if self.finished else self.step / MOST
+
+    @property
+    def error_of_total(self) -> float:
+        """Standard error of the total δ [m³]."""
+        return self._sphere.error_of_sum * abs(self._unit)
 
     @property
     def voxels(self) -> VoxelGrid:

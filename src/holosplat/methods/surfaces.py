@@ -20,9 +20,12 @@ from .first_surfaces import first_surfaces, is_noisy, surfaces_of_volume
 from .gaussians import Gaussians, GaussianStage
 from .keeper import BY
 from .method import Method, Near, Stage, Task, quiet, run_quietly
-from .surface_fit import SurfaceOptions, extract_surfaces, frames_of, surface_fit
+from .surface_fit import Extraction, SurfaceOptions, extract_surfaces, frames_of, surface_fit
 
 STAGE = "surfaces"
+
+Cut = Callable[[Extraction], SurfaceMesh]
+"""Gets surfaces out of Gaussians."""
 
 
 @dataclass(frozen=True)
@@ -89,25 +92,35 @@ class BodiesStage(GaussianStage):
         straight = self._straight(task) and not is_noisy(task, self.options)
         return self.near_surfaces(task, surfaces) if straight or not self._small(task) else None
 
-    def best_cut(self, task: Task, cloud: GaussianCloud, cut: Callable[[], SurfaceMesh]) -> SurfaceMesh:
-        """The surfaces that `cut` gets out of `cloud`; but of small frames those of a first volume, where there are any
-        and they explain more by the policy of `select`.
+    def best_cut(self, task: Task, cloud: GaussianCloud, cut: Cut) -> SurfaceMesh:
+        """The surfaces that `cut` gets out of `cloud`; or, if they explain more by the policy of `select`, of small
+        frames those of a first volume, where there are any, and, where much matter is missing from the first after some
+        steps, those cut on finer voxels.
 
-        Errors: those of `cut`, where there are no others.
+        Marching cubes at one half leave out what is not much thicker than their voxels, and surfaces that are missing
+        do not grow. Errors: those of `cut`, where there are no others.
         """
-        alone = not (self._small(task) and self._straight(task) and task.bounded)
-        seen = self._without_validation(task)
-        other = None if alone else self._of_first_volume(task, cloud)
-        if other is None:
-            return cut()
+        if not task.bounded or task.freedom is not None:
+            return cut(self.surfaces.extraction)
+        how, seen, found = self.options.coarse, self._without_validation(task), dict[str, SurfaceMesh]()
+        steps, most = how.of_views(len(seen.scan.train())), how.missing_matter
+        other = self._of_first_volume(task, cloud) if self._small(task) and self._straight(task) else None
+        found |= {} if other is None else {"of a volume": other}
         try:
-            how = self.options.coarse.of_views(len(seen.scan.train()))
-            own = settled(seen, cut(), self.surfaces, how)
+            first = cut(self.surfaces.extraction)
         except InputError:  # Gaussians hold no surface
-            return other
-        found = {"of Gaussians": own, "of a volume": other}
+            if not found:
+                raise
+            return found["of a volume"]
+        if not found and self._missing(first, task) <= most:
+            return first
+        own = settled(seen, first, self.surfaces, steps)
+        if self._missing(own, task) > most:
+            found["on finer voxels"] = settled(seen, cut(self.surfaces.extraction.finer()), self.surfaces, steps)
+        found = {"of Gaussians": own, **found}
         decision = select("surfaces", tuple(found), lambda name, _: self._score(found[name], seen), by=BY)
-        return found[decision.choice]
+        alone = decision.choice == "of Gaussians" and "of a volume" not in found
+        return first if alone else found[decision.choice]
 
     def _of_first_volume(self, task: Task, cloud: GaussianCloud) -> SurfaceMesh | None:
         """Surfaces without which Gaussians began, as they explain the frames badly; in noise, where Gaussians do, those
@@ -144,7 +157,7 @@ class SurfaceStage:
     options: SurfaceOptions
     coarse: CoarseToFine = field(default_factory=CoarseToFine)
     """How few steps a near start takes."""
-    choose: Callable[[Task, GaussianCloud, Callable[[], SurfaceMesh]], SurfaceMesh] | None = None
+    choose: Callable[[Task, GaussianCloud, Cut], SurfaceMesh] | None = None
     """What a task begins with, by Gaussians and what cuts surfaces out of them; None: with these."""
     name: str = STAGE
 
@@ -159,8 +172,8 @@ class SurfaceStage:
             "reconstruct with --method gaussians first.",
         )
         assert isinstance(before, GaussianCloud)
-        cut = partial(extract_surfaces, before, task.scan, self.options.extraction)
-        return cut() if self.choose is None else self.choose(task, before, cut)
+        cut = partial(extract_surfaces, before, task.scan)
+        return cut(self.options.extraction) if self.choose is None else self.choose(task, before, cut)
 
     def fit(self, task: Task, start: Stored) -> Fit:
         """The fit of the surfaces to the training frames."""

@@ -18,7 +18,7 @@ from ..fit.smooth_volume import ContinuousPrior
 from ..geometry import Grid
 from ..matter import DeltaBeta, KnownRatio, Matter
 from ..optics.retrieval.spectra import contrast_level
-from ..ranges import Weight, checked_dataclass
+from ..ranges import Signed, Weight, checked_dataclass
 from ..representations import Stored, VoxelGrid
 from ..scan import Scan
 from .cross_validation import predicted_frames
@@ -74,10 +74,15 @@ class SmoothVolume(Method):
     """Iterations of a round."""
     max_voxels: int = 20_000_000
     """Frames are binned rather than having more voxels than this."""
+    told: tuple[Signed, ...] = ()
+    """Total δ of spherical matter, and the standard error of that [m³], where something else than frames tells them,
+    as the other times of a series do; empty: nothing does."""
 
     def __post_init__(self) -> None:
         at_least(self, 1, "max_voxels", "loose")
         sizes = all(factor >= 2 for factor in self.coarser) and list(self.coarser) == sorted(self.coarser, reverse=True)
+        told = len(self.told) in (0, 2) and all(error > 0 for error in self.told[1:])
+        require(told, f"told must be a total and its positive standard error, or empty, but it is {self.told}.")
         require(sizes, f"coarser must be whole numbers from 2 on, the largest first, but it is {self.coarser}.")
 
     def stages(self) -> tuple[Stage, ...]:
@@ -132,7 +137,8 @@ class SmoothStage:
         known = task.prior.materials if len(task.prior.materials) > 1 else ()
         plan = SmoothPlan(scan, start, noise, task.prior.fixes_ratio, light, *how, backend, known)
         if task.prior.spherical:
-            return SphericalFit(plan.frames(1), start, backend, task.prior.lower)
+            return SphericalFit(plan.frames(1), start, backend, task.prior.lower, options.told)
+        require(not options.told, "told is of spherical matter, but the matter is of any shape; leave it.")
         return SmoothFit(plan)
 
 

@@ -275,8 +275,9 @@ class Front:
     def of(cls, volume: Volume, seed: int = 0) -> Front:
         """The spherical front that runs from the middle of the matter.
 
-        The radial mean shows where; then centre, radius, step, slope behind it, level before it and width are fitted to
-        the voxels of a shell by least squares. Eighths of the directions left out in turn (jackknife) give the errors,
+        The radial mean shows where; then centre, radius, step, what is behind it (a polynomial of degree two of the
+        depth, for a thin shell falls off within the fitted one), level before it and width are fitted to the voxels of
+        a shell by least squares. Eighths of the directions left out in turn (jackknife) give the errors,
         since errors of neighbouring voxels go together. Errors: `InputError` where nothing is in the volume.
         """
         unit = float(min(volume.grid.voxel_size))
@@ -285,7 +286,7 @@ class Front:
         values = volume.delta.ravel() / float(np.abs(volume.delta).max(initial=1e-30))
         require(bool(values.any()), "a front needs matter that changes, but the volume is empty; check the run.")
         centre = np.average(places, axis=0, weights=values**2)
-        numbers = np.array([*centre, _jump(places - centre, values), 0.0, 0.0, 0.0, 0.7])
+        numbers = np.array([*centre, _jump(places - centre, values), 0.0, 0.7])
         random = np.random.default_rng(seed)
         for _ in range(3):
             away = np.linalg.norm(places - numbers[:3], axis=1)
@@ -317,26 +318,26 @@ def _jump(places: np.ndarray, values: np.ndarray) -> float:
 
 
 def _fitted(places: np.ndarray, values: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Centre, radius, step, slope, level, width that fit best."""
+    """Centre, radius, step, width that fit best."""
 
-    def shape(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def design(numbers: np.ndarray) -> np.ndarray:
         depth = numbers[3] - np.linalg.norm(places - numbers[:3], axis=1)
-        return depth, ndtr(depth / numbers[4])
+        step = ndtr(depth / numbers[4])
+        return np.stack([step, step * depth, step * depth**2, np.ones_like(step)], axis=1)
 
-    def missed(curved: np.ndarray) -> np.ndarray:
-        depth, step = shape(curved)
-        design = np.stack([step, step * depth, np.ones_like(step)], axis=1)
-        return design @ np.linalg.lstsq(design, values, rcond=None)[0] - values
+    def best(shape: np.ndarray) -> np.ndarray:
+        return np.linalg.lstsq(shape, values, rcond=None)[0]
 
-    first, radius = start[[0, 1, 2, 3, 7]], start[3]
+    def missed(numbers: np.ndarray) -> np.ndarray:
+        shape = design(numbers)
+        return shape @ best(shape) - values
+
+    first, radius = start[[0, 1, 2, 3, 5]], start[3]
     reach = np.array([0.5 * radius] * 4 + [np.inf])
     low, high = first - reach, first + reach
     low[4], high[4] = NARROWEST, max(radius, 2 * NARROWEST)
     found = least_squares(missed, np.clip(first, low, high), bounds=(low, high)).x
-    depth, step = shape(found)
-    design = np.stack([step, step * depth, np.ones_like(step)], axis=1)
-    linear = np.linalg.lstsq(design, values, rcond=None)[0]
-    return np.array([*found[:4], *linear, found[4]])
+    return np.array([*found[:4], best(design(found))[0], found[4]])
 
 
 def front_rows(numbers: Sequence[int], times: Sequence[float], fronts: Sequence[Front]) -> Iterable[list[object]]:

@@ -19,7 +19,7 @@ from ..tables import from_table
 from .plan import SeriesPlan, Window, natural
 
 ROW = "row.json"
-Begun = Literal["", "cold", "warm", "anew", "back"]
+Begun = Literal["", "cold", "warm", "anew", "back", "conserved"]
 Body = tuple[float, float, float, float]
 
 
@@ -29,7 +29,8 @@ class Row:
 
     - status: `done`, or `failed` for the `reason` given
     - begun: `cold`, by itself; `warm`, with what the time before ended with; `anew`, by itself, which was no worse than
-      warm; `back`, with what the time after ended with, which was no worse than that; decided: by what evidence
+      warm; `back`, with what the time after ended with, which was no worse than that; `conserved`, with the total of
+      all other times; decided: by what evidence
     - kind, size: of the object; unexplained: share of the matter that training frames leave; good: whether frames are
       explained; words: that in a sentence
     - test, train: means over held-out and training frames: ssim, frcm, psnr [dB], l1; empty where there are none

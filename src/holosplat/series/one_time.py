@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -30,6 +30,7 @@ from ..representations import Stored, SurfaceMesh
 from ..scan import Scan
 from ..units import wavenumber
 from ..workflows.evaluate import Evaluation, evaluate, render
+from ..workflows.preconditions import decided_before
 from ..workflows.reconstruct import load_reconstruction, reconstruct
 from ..workflows.reconstruction import Reconstruction
 from ..workflows.run_folder import RunFolder, claimed
@@ -39,9 +40,11 @@ from .plan import Settings, prior_of
 
 PHASE = "phase.npy"
 """The phase in the first view [rad], for pages."""
-BEGUN, BACK, REFERENCE = "begun.json", "back.json", "reference.npy"
-"""How a time was begun, where that was decided; the same on the way back; and what the last time that was begun by
-itself, or was compared with one that was, left of its frames: the powers of a `Score`."""
+BEGUN, BACK, CONSERVED, REFERENCE = "begun.json", "back.json", "conserved.json", "reference.npy"
+"""How a time was begun, where that was decided; the same on the way back, and with the others' total; and what the last
+time that was begun by itself, or was compared with one that was, left of its frames: the powers of a `Score`."""
+Told = tuple[float, ...]
+"""A total δ and its standard error [m³], or nothing."""
 WHAT = "what a time left of its frames"
 MOST_PIXELS = 160
 """Pixels along the longer edge of that, at most: it is binned until it has no more."""
@@ -103,7 +106,7 @@ def reconstruct_time(
         return _written(shot, settings, folder, done, row, began)
     alone = RunFolder(folder.path.with_name(f"{folder.path.name}.cold"))
     cold = _run(shot, settings, settings.method, alone, on_progress, on_state=on_state)
-    decision = _better(shot, settings, {"warm": done, "cold": cold})
+    decision = _better(shot, settings, {"warm": done, "cold": cold}, alone)
     said = {"begun": "warm" if decision.choice == "warm" else "anew", "decided": decision.line}
     if decision.choice == "warm":
         shutil.rmtree(alone.path)
@@ -132,31 +135,68 @@ def is_worse(shot: Shot, own: Before, after: Before, later: Scan) -> bool:
     return mine.powers.shape == others.powers.shape and Compared("", *mine.gain_over(others)).loses
 
 
-def retry_time(shot: Shot, settings: Settings, own: Before, after: Before, on_progress: FitProgress = quiet) -> Row:
+def retry_time(
+    shot: Shot, settings: Settings, own: Before, after: Before, told: Told = (), on_progress: FitProgress = quiet
+) -> Row:
     """Try a finished time again from the time after it; an unfinished try is continued.
 
     The better one is kept (`_better`), so that an error which a time handed on, or got from before, ends at the next
-    good one. Ctrl-C is passed on. Errors: `InputError` of `reconstruct`.
+    good one. told: the total δ by all other times, with which the time is tried again from itself: as this has one
+    unknown less, it is kept unless it explains the frames surely less well. Ctrl-C is passed on. Errors: `InputError`
+    of `reconstruct`.
     """
-    began, folder = time.perf_counter(), own.folder
+    began, folder, begun = time.perf_counter(), own.folder, "conserved" if told else "back"
     method = Continued.of(settings.method, after.folder.object.resolve(), settings.warm.effort)
-    other = RunFolder(folder.path.with_name(f"{folder.path.name}.back"))
-    if (folder.path / BACK).is_file():
-        said = read_json(folder.path / BACK)
-        done = None if said["begun"] != "back" else _run(shot, settings, method, folder, on_progress, after)
+    method = replace(method, volume=replace(method.volume, told=tuple(told)))
+    other, noted = RunFolder(folder.path.with_name(f"{folder.path.name}.{begun}")), f"{begun}.json"
+    if (folder.path / noted).is_file():
+        said = read_json(folder.path / noted)
+        done = None if said["begun"] != begun else _run(shot, settings, method, folder, on_progress, after)
     else:
         _remove_other(other, method)
-        tried = _run(shot, settings, method, other, on_progress, after)
-        decision = _better(shot, settings, {"back": tried, "kept": load_reconstruction(folder)})
+        tried, kept = _run(shot, settings, method, other, on_progress, after), load_reconstruction(folder)
+        found = {"kept": kept, begun: tried} if told else {begun: tried, "kept": kept}
+        decision = _better(shot, settings, found, folder)
         done = None if decision.choice == "kept" else tried
-        said = {"begun": "back" if done else own.row.begun, "decided": decision.line}
-        write_json((other if done else folder).path / BACK, said)
+        said = {"begun": begun if done else own.row.begun, "decided": decision.line}
+        write_json((other if done else folder).path / noted, said)
         shutil.rmtree((folder if done else other).path)
         if done:
             other.path.rename(folder.path)
     if done is None:
         return replace(own.row, **said)
-    return _written(shot, settings, folder, done, replace(shot.row, **said), began)
+    row = _written(shot, settings, folder, done, replace(shot.row, **said), began)
+    return replace(row, seconds=round(own.row.seconds + row.seconds, 3))
+
+
+def common_totals(rows: Sequence[Row]) -> dict[int, Told]:
+    """The total δ and its error [m³] that all other times tell of each one, where it may be conserved; else nothing.
+
+    It is where a common total, one number in place of one a time, lowers the log-likelihood by less than as many, by
+    Akaike's criterion (1974). Frames hardly tell slow changes, so that single totals may be far off.
+    """
+    known = [row for row in rows if row.total is not None and row.total_error]
+    if len(known) < max(2, len(rows)):
+        return {}
+    values, errors = (np.array([getattr(row, name) for row in known]) for name in ("total", "total_error"))
+    weights = errors**-2.0
+    common = float(weights @ values / weights.sum())
+    if 0.5 * float(weights @ (values - common) ** 2) >= len(known) - 1:
+        return {}
+    rest = weights.sum() - weights
+    others = (common * weights.sum() - weights * values) / rest
+    return {row.number: (float(at), float(of**-0.5)) for row, at, of in zip(known, others, rest)}
+
+
+def is_conserved(own: Before) -> bool:
+    """Whether a finished time was tried with the total of the others, and has its row."""
+    noted = own.folder.path / CONSERVED
+    return noted.is_file() and read_json(noted)["decided"] == own.row.decided
+
+
+def is_spherical(own: Before) -> bool:
+    """Whether a finished time is of spherical matter."""
+    return _known(own).spherical
 
 
 def _left(done: Reconstruction, scan: Scan) -> Score:
@@ -185,9 +225,11 @@ def _as_good(left: Score, reference: Path) -> bool:
     return other.powers.shape == left.powers.shape and not Compared("", *left.gain_over(other)).loses
 
 
-def _better(shot: Shot, settings: Settings, found: Mapping[str, Reconstruction]) -> Decision:
-    """The better one of two results, the null last: by the policy of a run's states (`Keeper`)."""
-    task = prepared(Task(shot.scan.train(), shot.prior, settings.seed, light=settings.light), settings.method)
+def _better(shot: Shot, settings: Settings, found: Mapping[str, Reconstruction], by: RunFolder) -> Decision:
+    """The better one of two results, the null last: by the policy of a run's states (`Keeper`), in the light that
+    the run `by` decided for."""
+    task = Task(shot.scan.train(), shot.prior, settings.seed, light=settings.light)
+    task = prepared(task, settings.method, decided_before(by.read_config()["decided"]))
     keeper = Keeper(task.scan, mixed=True, unseen=partial(decide_kind, task, settings.method))
     for name, done in found.items():
         keeper.look(name, done.object, done.oversample)
@@ -223,8 +265,7 @@ def _run(
     if before is not None:  # it was decided there
         summary = before.folder.read_summary()
         matter = "continuous" if summary.get("decided", {}).get("matter") == "continuous" else "levels"
-        made = [Decision.from_dict(each) for each in summary.get("decisions", ())]
-        prior = with_sign(prior_of(before.folder.read_config()["prior"]), made)
+        prior = _known(before)
     done = reconstruct(
         shot.scan,
         prior,
@@ -240,6 +281,12 @@ def _run(
     if not done.finished:
         raise KeyboardInterrupt
     return done
+
+
+def _known(before: Before) -> MaterialPrior:
+    """The prior of a finished time, with the sides of the medium that were decided."""
+    made = [Decision.from_dict(each) for each in before.folder.read_summary().get("decisions", ())]
+    return with_sign(prior_of(before.folder.read_config()["prior"]), made)
 
 
 def _share(done: Reconstruction) -> float:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..bodies.rest_shape import moments
 from ..checks import InputError, is_of_memory, require
-from ..io.atomic import write_json
+from ..io.atomic import read_json, write_json
 from ..io.formats import read_frames, run_source
 from ..io.lock import sole_writer
 from ..io.reading import Reading
@@ -25,7 +25,20 @@ from ..workflows.reconstruction import Reconstruction
 from ..workflows.run_folder import RunFolder, claimed
 from ..workflows.track import track
 from .folder import DONE, FAILED, Row, SeriesFolder, TaskState, read_row, write_row
-from .one_time import PHASE, Before, Shot, is_worse, reconstruct_time, retry_time, write_phase
+from .one_time import (
+    CONSERVED,
+    PHASE,
+    Before,
+    Shot,
+    Told,
+    common_totals,
+    is_conserved,
+    is_spherical,
+    is_worse,
+    reconstruct_time,
+    retry_time,
+    write_phase,
+)
 from .plan import Moment, SeriesPlan, Settings, Source, Window, at, fingerprint
 
 OnRow = Callable[[Row], None]
@@ -91,7 +104,8 @@ def _work(folder: SeriesFolder, plan: SeriesPlan, window: Window, on_row: OnRow)
         else:
             failed.append(row)
     if not failed:
-        return _back(folder, plan, window, scans, on_row) if plan.settings.warm.on else ""
+        again = (_back, _conserved) if plan.settings.warm.on else ()
+        return "; ".join(filter(None, (each(folder, plan, window, scans, on_row) for each in again)))
     return f"{len(failed)} of {len(window.moments)} times: {failed[0].reason}"
 
 
@@ -111,6 +125,34 @@ def _back(folder: SeriesFolder, plan: SeriesPlan, window: Window, scans: Scans, 
             own = replace(own, row=row)
         after = [(own, shot.scan)]
     return f"{len(failed)} times could not be tried again: {failed[0]}" if failed else ""
+
+
+def _conserved(folder: SeriesFolder, plan: SeriesPlan, window: Window, scans: Scans, on_row: OnRow) -> str:
+    """Try times of spherical matter again with the total δ that the others tell, where it may be conserved
+    (`common_totals`); why not all of them could be, or nothing."""
+    every = [
+        (moment, Before(RunFolder(folder.run(window.number, moment.number)), read_row(path)))
+        for moment in window.moments
+        if (path := folder.row(window.number, moment.number))
+    ]
+    if not all(is_spherical(own) for _, own in every):
+        return ""
+    noted, failed = folder.task(window.number) / CONSERVED, list[str]()
+    if not noted.is_file():
+        write_json(noted, {str(number): told for number, told in common_totals([own.row for _, own in every]).items()})
+    for number, told in read_json(noted).items():
+        moment, own = next(each for each in every if each[0].number == int(number))
+        if is_conserved(own):
+            continue
+
+        def work(moment: Moment = moment, own: Before = own, told: Told = tuple(told)) -> str:
+            row = retry_time(_shot(plan, moment, scans), plan.settings, own, own, told)
+            write_row(folder.row(window.number, moment.number), row)
+            on_row(row)
+            return ""
+
+        failed += [reason] if (reason := attempted(work)) else []
+    return f"{len(failed)} times could not be tried with the total of the others: {failed[0]}" if failed else ""
 
 
 def _tried_again(

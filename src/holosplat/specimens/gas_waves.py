@@ -102,6 +102,8 @@ def waves(
 
 CELLS, SNAPSHOTS = 240, 64
 """Cells to the last front, and kept times, of a shock."""
+BEYOND = 1.05
+"""Radii of the front out to which it is drawn: the scheme smears it over some cells, and it is at half its height."""
 WATER = Fluid(4.4, 1 / 4.4)
 """In units of the medium's density and speed of sound."""
 
@@ -137,7 +139,8 @@ class ExpandingShock(SpecimenKind):
         centre = self.shift * self.size * random_direction(np.random.default_rng(seed))
 
         def shock(share: float) -> ContinuousScene:
-            return ContinuousScene((ellipsoid(centre, [self.radius(share)] * 3, self._profile(share), medium),))
+            half = [BEYOND * self.radius(share)] * 3
+            return ContinuousScene((ellipsoid(centre, half, self._profile(share), medium),))
 
         def within(share: float) -> ContinuousScene:
             return ContinuousScene((ellipsoid(centre, [self.radius(share)] * 3, Soft(0.0), SHARE),))
@@ -150,11 +153,11 @@ class ExpandingShock(SpecimenKind):
         return 0.5 * self.size * float(np.interp(share, np.linspace(0, 1, SNAPSHOTS), fronts))
 
     def _profile(self, share: float) -> Radial:
-        """Density over the medium's, less one, in radii of the front."""
+        """Density over the medium's, less one, out to `BEYOND`."""
         edges, _, density = burst(self.core, self.pressure, self.first)
         at = min(max(share, 0.0), 1.0) * (SNAPSHOTS - 1)
         k = min(int(at), SNAPSHOTS - 2)
-        return Radial(edges, (1 - at + k) * density[k] + (at - k) * density[k + 1])
+        return Radial(edges / BEYOND, (1 - at + k) * density[k] + (at - k) * density[k + 1])
 
 
 RADII = 4096
@@ -191,7 +194,7 @@ class Radial:
 def burst(core: float, pressure: float, first: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A hot core of radius `core` in a medium at rest: edges of shells [N + 1] in radii of the front, radii of the
     front [T] at even times from `first` to 1, and density over the medium's, less one, [T, N] in the shells."""
-    shells = np.linspace(0, 1, CELLS + 1)
+    shells = np.linspace(0, BEYOND, round(BEYOND * CELLS) + 1)
     edges = np.concatenate([[0.0], np.arange(3, 1.2 * CELLS) / CELLS])  # a short first cell would need short steps
     middles, inner = (0.5 * (each[1:] + each[:-1]) for each in (edges, shells))
     state = np.stack([np.ones_like(middles), 0 * middles, pressure * np.exp(-((middles / core) ** 4))])

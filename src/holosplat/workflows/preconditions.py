@@ -10,8 +10,10 @@ import numpy as np
 
 from ..checks import as_written, require
 from ..inference import Decision
+from ..io.atomic import read_json
 from ..io.provenance import sha256
-from ..methods import Task
+from ..methods import Method, Task
+from ..methods.continued import Continued
 from ..methods.contrast import STAGE as SIGN
 from ..methods.illumination import STAGE, Prepared
 from ..methods.levels import SHOWN
@@ -90,6 +92,15 @@ def decided_before(decided: Mapping[str, Any]) -> Prepared:
     """The decisions on sign, light and noise of a run that goes on, by the entry `decided` of its config.json."""
     made = tuple(Decision.from_dict(each) for each in decided["decisions"])
     return tuple(str(each) for each in decided["light"]), made
+
+
+def decided_there(method: Method) -> Prepared | None:
+    """What was decided of sign, light and noise by the run that `method` goes on from, which holds for the same matter
+    a little later; None where it begins by itself, or no run is beside the file that it begins with."""
+    if not isinstance(method, Continued):
+        return None
+    there = RunFolder(method.begin.parent).config
+    return decided_before(read_json(there)["decided"]) if there.is_file() else None
 
 
 FEWEST_COLUMNS = 11

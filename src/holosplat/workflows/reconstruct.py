@@ -33,6 +33,7 @@ from .choice import Choice
 from .preconditions import (
     check_frames,
     decided_before,
+    decided_there,
     decisions_of,
     goes_on,
     is_complete,
@@ -142,7 +143,7 @@ def reconstruct(
             task = prepared(task, method, before)
         else:
             with run.timed("decision"):
-                task = prepared(task, method)
+                task = prepared(task, method, decided_there(method))
                 found = settled(method, task, matter, ranges)
         task = found.task(task)
         if isinstance(method, Auto) and method.gaussians.start == "learned" and found.matter == "continuous":

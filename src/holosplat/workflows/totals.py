@@ -15,8 +15,9 @@ from ..fit.residuals import Prediction
 from ..geometry import Grid
 from ..methods import Task
 from ..methods.modulation import DOUBTFUL, RATIO_SHARE, Total, total_delta
+from ..methods.spherical import SphericalFit
 from ..methods.uncertain import Determined
-from ..methods.volume import binning
+from ..methods.volume import SmoothStage, SmoothVolume, binning
 from ..optics.noise import NoiseModel
 from ..representations import Stored, VoxelGrid
 from ..scan import Scan
@@ -81,6 +82,12 @@ def total_of_run(said: Prediction, frames: Scan, task: Task, constants: tuple[De
     quantity: Literal["δ", "β"] = "δ" if task.delta_told else "β"
     held = _held(found, frames)
     sign, against = found.matter.channels[0].sign, task.prior.against
+    if task.prior.spherical and isinstance(found, VoxelGrid) and bool(found.values.any()):
+        fit = SmoothStage(SmoothVolume()).fit(task, found)
+        assert isinstance(fit, SphericalFit)
+        error = fit.error_of_total
+        words = f"total {quantity} against {against} {held:.3g} m³ ± {error:.2g} m³, of spherical matter"
+        return TotalMatter(quantity, held, error, held, words)
     if task.prior.two_sided:
         words = (
             f"total {quantity} against {against} {held:.3g} m³ in the volume; of matter on both sides no error is known"
