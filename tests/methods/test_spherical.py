@@ -97,6 +97,15 @@ def test_a_total_is_told_of_spherical_matter_alone(scan):
             SmoothVolume(told=told)
 
 
+def test_a_sphere_that_has_left_the_field_ends(scan):
+    """As in uneven light, which matter on one side cannot explain; a run ended in a singular matrix there."""
+    sphere = sphere_of(scan, torch.zeros(SHAPE[1], *SHAPE))
+    sphere.unknowns[0] = 900.0
+    sphere.step()
+    assert sphere.ended
+    assert not sphere.volume().any()
+
+
 def test_a_shock_is_found_in_three_beams(scan, shock):
     """As voxels of any kind it is not: nine tenths of the field are free then."""
     done = hs.reconstruct(scan, SPHERE, SmoothVolume(), light=PLAIN)

@@ -78,6 +78,9 @@ class Sphere:
     def step(self) -> None:
         """One step, if any helps; where none does for the first time, the profile is cut (`_cut`), and it goes on."""
         level, matrix, missing, _ = self._equations()
+        if not matrix.any():  # the centre has left the field, and nothing is seen of the sphere
+            self.ended = True
+            return
         free = (self.unknowns > self.lower) | (missing > 0)
         diagonal = torch.diag(matrix.diag().clamp_min(LEAST * float(matrix.diag().max())))
         gained = 0.0
