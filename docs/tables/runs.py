@@ -382,9 +382,11 @@ def random_scenes() -> str:
 
 @table("families-rules", DECIDED, "an hour", "decision_families.csv")
 def families_rules() -> str:
-    """Families that rules of decision were made on beside all others."""
+    """Families that rules of decision were made on beside all others: the last seed, which has the present rules."""
     of = script("families")
-    return markdown(of.RULES, of.table_of_rules(of.rows_of(of.PAGE))).replace("|  |", "| |", 1)
+    rows = of.rows_of(of.PAGE)
+    last = max(row.seed for row in rows)
+    return markdown(of.RULES, of.table_of_rules([r for r in rows if r.seed == last])).replace("|  |", "| |", 1)
 
 
 @table("families-scenes", DECIDED, "an hour", "decision_families.csv")
