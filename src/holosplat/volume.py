@@ -184,6 +184,12 @@ class Wall:
         )
 
     @property
+    def inside(self) -> float:
+        """Distance from the axis [m] beyond which there is nothing of the hollow."""
+        half = 0.5 * (max(self.inner) if self.round else np.hypot(*self.inner))
+        return float(half + np.hypot(*self.centre))
+
+    @property
     def _parts(self) -> list[tuple[Section, np.ndarray]]:
         """Sections, and the (δ, β) that each adds to what is around it."""
         filled = [(self.inner, np.subtract(self.filling, self.matter))]
@@ -249,18 +255,8 @@ class Wall:
         fall = np.maximum(reach - flat, np.finfo(float).tiny)
         return np.sign(s) * height * (t - 0.5 * beyond**2 / fall)
 
-    def hollow(self, grid: Grid) -> np.ndarray:
-        """[Z, Y, X] bool, the voxels of `grid` a part of which lies in the hollow: beyond, what is known fills them."""
-        return np.broadcast_to(self._shares(grid)[-1][:, None] > 0, grid.shape)
-
     def voxelise(self, grid: Grid) -> Volume:
         """δ and β, by the share of each voxel that lies in the wall and in the hollow."""
-        total = np.tensordot(np.stack([added for _, added in self._parts], axis=1), np.stack(self._shares(grid)), 1)
-        delta, beta = (np.broadcast_to(part[:, None], grid.shape) for part in total)
-        return Volume(delta, beta, grid)
-
-    def _shares(self, grid: Grid) -> list[np.ndarray]:
-        """Shares [Z, X] of the voxels of `grid` that lie in each section, the hollow last."""
         x, _, z = grid.axes()
         steps = (np.arange(FINER) + 0.5) / FINER - 0.5
         fine = [
@@ -269,8 +265,11 @@ class Wall:
         ]
         px, pz = fine[0][None] - self.centre[0], fine[1][:, None] - self.centre[1]
         cos, sin = np.cos(self.turn), np.sin(self.turn)
-        u, v, found = px * cos - pz * sin, px * sin + pz * cos, []
-        for (wide, deep), _ in self._parts:
+        u, v = px * cos - pz * sin, px * sin + pz * cos
+        total = np.zeros((2, len(z), len(x)))
+        for (wide, deep), added in self._parts:
             within = u**2 + v**2 <= (0.5 * wide) ** 2 if self.round else (abs(u) <= 0.5 * wide) & (abs(v) <= 0.5 * deep)
-            found.append(within.reshape(len(z), FINER, len(x), FINER).mean(axis=(1, 3)))
-        return found
+            share = within.reshape(len(z), FINER, len(x), FINER).mean(axis=(1, 3))
+            total += added[:, None, None] * share
+        delta, beta = (np.broadcast_to(part[:, None], grid.shape) for part in total)
+        return Volume(delta, beta, grid)

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 import holosplat as hs
-from holosplat.baselines import HolographicTV, holographic_tv
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views, rotation_tilted
 from holosplat.io.formats import read_as
@@ -88,34 +87,6 @@ def test_voxels_hold_the_wall_and_the_filling(wall):
     assert volume.delta.max() == pytest.approx(GLASS.delta)
     D = wall.project(Views.from_angles([0.0], (3, 33), PIXEL))[1][0, 1]
     np.testing.assert_allclose(volume.delta[:, 1].sum(axis=0) * PIXEL, D, rtol=0, atol=0.03 * float(D.max()))
-
-
-@pytest.mark.parametrize("wall", [BOX, TUBE])
-def test_the_hollow_has_every_voxel_that_is_not_all_wall(wall):
-    """Its area is that of the section and, along the circumference, of voxels of which a part lies outside."""
-    grid = Grid.centred((51, 3, 45), voxel_size=0.5 * PIXEL)
-    hollow, (wide, deep) = wall.hollow(grid), wall.inner
-    assert hollow.shape == grid.shape
-    assert (hollow == hollow[:, :1]).all()
-    area = wide * deep * (np.pi / 4 if wall.round else 1.0)
-    around = np.pi * wide if wall.round else 2 * (wide + deep)
-    assert 0 < hollow[:, 0].sum() * (0.5 * PIXEL) ** 2 - area < 0.5 * PIXEL * around
-    filled = wall.voxelise(grid).delta
-    walls = np.isin(filled[~hollow], np.array([0.0, GLASS.delta], np.float32))
-    assert walls.mean() > 0.8  # the others hold an outer face
-    assert not np.isin(filled[hollow], np.float32(GLASS.delta)).any()
-
-
-def test_matter_in_a_wall_is_sought_in_its_hollow():
-    """Which is no circle: a flat channel's corners are further from the axis than its wall is."""
-    views = Views.evenly_spaced(4, (9, 25), PIXEL)
-    exposures = replace(hs.Exposures.of(views, energy_kev=20.0, distance=0.05), wall=BOX)
-    cell = hs.MeshScene.of_one_material([box_mesh((-4e-6, -1, -3e-6), (3e-6, 1, 4e-6))], WATER)
-    scan = hs.Scan(measure(cell, exposures, 2).numpy(), exposures, np.zeros(4, bool))
-    few = HolographicTV(retrieval=3, iterations=6, corrections=0, upper=1.0, refine=1)
-    volume, grid = holographic_tv(scan, WATER, few, lambda stage, part: None)
-    assert volume.abs().max() > 0.1
-    assert not volume[~torch.from_numpy(BOX.hollow(grid).copy())].any()
 
 
 def test_the_mean_wave_of_half_a_pixel_of_phase():

@@ -245,16 +245,14 @@ def _volume_of(
     """Total variation on the thickness [V, H, W] of views, which may have rows and columns beyond the frames."""
     beyond = _margins(lines, scan)
     field, gaps = scan.views.padded(beyond), unseen_rays(scan, beyond)
-    grid, wall = Grid.of_views(field), scan.exposures.wall
-    rays = rays_of(lines, field, grid, options.backend, gaps)
+    rays = rays_of(lines, field, Grid.of_views(field), options.backend, gaps)
     first = min(TotalVariation.first, options.iterations)
     known = {"still_light": options.still_light, "misfit": options.misfit, "two_sided": options.two_sided}
-    inside = options.inside / scan.views.finest
+    wall = scan.exposures.wall
+    inside = (options.inside or (0.0 if wall is None else wall.inside)) / scan.views.finest
     steps = TotalVariation(first=first, iterations=options.iterations - first, inside=inside, **known)
     weights = photons_left(lines, scan.exposures, material)
-    hollow = None if wall is None else torch.from_numpy(wall.hollow(grid).copy())
-    report, backend = partial(on_progress, "tomography"), options.backend
-    return tv_solver(rays, options.upper or None, steps, report, backend, weights, hollow)
+    return tv_solver(rays, options.upper or None, steps, partial(on_progress, "tomography"), options.backend, weights)
 
 
 def _settled(

@@ -106,7 +106,6 @@ def tv_solver(
     on_progress: Advance,
     backend: str = "cpu",
     weights: Tensor | None = None,
-    hollow: Tensor | None = None,
 ) -> PrimalDual:
     """The solver of `total_variation` after its last iteration, for those who go on from there.
 
@@ -115,8 +114,7 @@ def tv_solver(
     the first of them there is no total variation.
 
     weights: trust in each ray [V, H, W], above 0; with them, or with still light, frequencies are trusted alike to the
-    end. hollow: voxels [Z, Y, X] bool beyond which there is no matter. Rays of missing pixels take the line integral of
-    the volume, and so have no weight.
+    end. Rays of missing pixels take the line integral of the volume, and so have no weight.
     """
     like = rays.measured
     start, coupling = like.new_zeros(rays.grid.shape), 1 / rays.refine**2
@@ -125,9 +123,7 @@ def tv_solver(
     if weights is not None:
         solver.weigh(weights.to(like))
     if options.inside > 0:
-        hollow = near_axis(rays.grid, options.inside)
-    if hollow is not None:
-        solver.keep_inside(hollow.to(like.device))
+        solver.keep_inside(near_axis(rays.grid, options.inside).to(like.device))
     if options.still_light > 0:
         solver.with_still_light(smooth_modes(rays.views.shape, options.still_light, like.device)[1:])
     alike = weights is not None or options.still_light > 0
@@ -178,8 +174,7 @@ def misfit_spectrum(rays: Rays, misfit: Tensor) -> Tensor:
 
 def plateau(occupancy: Tensor) -> float:
     """The level [units of `occupancy`] that most of the matter has: the mass-weighted median of [Z, Y, X] ≥ 0."""
-    values = occupancy[occupancy > 0]
-    values = torch.from_numpy(np.sort(values.numpy())) if values.device.type == "cpu" else values.sort().values
+    values = occupancy[occupancy > 0].sort().values
     if not len(values):
         raise NoMatterError
     mass = values.double().cumsum(0)
