@@ -93,7 +93,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     every = [SHOCK, *MEASURED_FAMILIES, *SIMULATED]
     parser.add_argument("--family", nargs="+", choices=every, default=every, metavar="NAME")
-    parser.add_argument("--seeds", nargs="+", type=int, default=[101, 105])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[101])
     parser.add_argument("--data", type=Path, help="the folder of measured frames")
     parser.add_argument("--out", type=Path, default=PAGE)
     options = parser.parse_args()

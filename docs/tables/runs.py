@@ -382,11 +382,15 @@ def random_scenes() -> str:
 
 @table("families-rules", DECIDED, "an hour", "decision_families.csv")
 def families_rules() -> str:
-    """Families that rules of decision were made on beside all others: the last seed, which has the present rules."""
+    """Families that rules of decision were made on beside all others: all rows, and those of the last seed alone."""
     of = script("families")
     rows = of.rows_of(of.PAGE)
     last = max(row.seed for row in rows)
-    return markdown(of.RULES, of.table_of_rules([r for r in rows if r.seed == last])).replace("|  |", "| |", 1)
+    lines = of.table_of_rules(rows)
+    beside = of.table_of_rules([row for row in rows if row.seed == last])
+    head = (of.RULES[0], *(f"{name}, {seeds}" for seeds in ("all seeds", f"seed {last}") for name in of.RULES[1:3]))
+    joined = [[*line[:3], *other[1:3], line[3]] for line, other in zip(lines, beside)]
+    return markdown((*head, of.RULES[3]), joined).replace("|  |", "| |", 1)
 
 
 @table("families-scenes", DECIDED, "an hour", "decision_families.csv")

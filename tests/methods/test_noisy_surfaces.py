@@ -184,21 +184,25 @@ def test_of_the_surfaces_of_clean_frames_those_that_explain_more_are_taken(poor,
     """Gaussians that began because surfaces explained the frames badly may explain them worse: then these are taken."""
     monkeypatch.setattr(BodiesStage, "near_surfaces", lambda *given: pytest.fail("they are there"))
     clean = task_of(1e7)
-    stage, cloud = BodiesStage(OPTIONS, surfaces=HOW, poor=[mesh_of(poor)]), cloud_of_surfaces(mesh_of(cut), clean)
+    stage, cloud = (
+        BodiesStage(OPTIONS, surfaces=HOW, poor=[(clean.scan, mesh_of(poor))]),
+        cloud_of_surfaces(mesh_of(cut), clean),
+    )
     assert len(stage.best_cut(clean, cloud, lambda how: mesh_of(cut)).faces) == len(mesh_of().faces)
 
 
 def test_where_first_surfaces_explained_clean_frames_there_are_no_others(monkeypatch):
     monkeypatch.setattr(BodiesStage, "near_surfaces", lambda *given: pytest.fail("it was asked"))
     clean = task_of(1e7)
-    stage, cloud = BodiesStage(OPTIONS, surfaces=HOW, poor=[None]), cloud_of_surfaces(mesh_of(2), clean)
+    stage = BodiesStage(OPTIONS, surfaces=HOW, poor=[(clean.scan, None)])
+    cloud = cloud_of_surfaces(mesh_of(2), clean)
     assert torch.equal(stage.best_cut(clean, cloud, lambda how: mesh_of(2)).vertices, mesh_of(2).vertices)
 
 
 @pytest.mark.parametrize("there", [True, False])
 def test_a_resumed_run_of_clean_frames_makes_its_first_surfaces_anew(there, monkeypatch):
     def near(stage: BodiesStage, task: Task, surfaces: SurfaceOptions) -> None:
-        stage.poor.append(mesh_of(4) if there else None)
+        stage.poor[:] = [(task.scan, mesh_of(4) if there else None)]
 
     monkeypatch.setattr(BodiesStage, "near_surfaces", near)
     found, _ = best_cut(task_of(1e7), 2)

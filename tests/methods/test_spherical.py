@@ -89,12 +89,12 @@ def test_a_total_that_is_told_counts_by_its_error(scan, shock):
 
 def test_a_total_is_told_of_spherical_matter_alone(scan):
     task = Task(scan, MaterialPrior.of_ratio(WATER.ratio).on_both_sides(), matter="continuous", light=PLAIN)
-    stage = SmoothStage(SmoothVolume(told=(0.0, 1e-24)))
-    with pytest.raises(InputError, match="told is of spherical matter"):
+    stage = SmoothStage(SmoothVolume(known_total=(0.0, 1e-24)))
+    with pytest.raises(InputError, match="known_total is of spherical matter"):
         stage.fit(task, stage.start(task, None))
     for told in ((1.0,), (1.0, 0.0)):
-        with pytest.raises(InputError, match="told must be a total and its positive standard error"):
-            SmoothVolume(told=told)
+        with pytest.raises(InputError, match="known_total must be a total and its positive standard error"):
+            SmoothVolume(known_total=told)
 
 
 def test_a_sphere_that_has_left_the_field_ends(scan):

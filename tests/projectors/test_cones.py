@@ -14,9 +14,11 @@ from helpers.voxels import anyhow, around, randoms
 from holosplat.baselines.algebraic import Algebraic, sirt
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Poses, Views
+from holosplat.matter import Matter
 from holosplat.projectors.mesh import mesh_line_integrals, voxelise_meshes
 from holosplat.projectors.surface import surface_thickness
 from holosplat.projectors.voxels import LatticeProjector, RayProjector, projector_for, voxel_line_integrals
+from holosplat.representations import VoxelGrid
 from holosplat.specimens.red_cells import icosphere
 
 UNEVEN = Grid((11, 7, 9), (1.1, 0.8, 0.9), (-4.0, -2.9, -3.7))
@@ -296,3 +298,16 @@ def test_tomography_of_cones_is_as_good_as_that_of_parallel_beams():
 
     assert error(cone, cone) < 1.03 * error(parallel, parallel)
     assert error(cone, parallel) > 1.2 * error(cone, cone)
+
+
+def test_voxels_give_gradients_to_sources_alone():
+    """Of poses whose other numbers are known."""
+    poses = Poses.of(AXIS)
+    assert poses.sources is not None
+    poses = replace(poses, sources=poses.sources.clone().requires_grad_())
+    grid = Grid.centred((12, 12, 17), AXIS.pitch)
+    values = torch.rand(1, *grid.shape, generator=torch.Generator().manual_seed(3))
+    VoxelGrid(values, grid, Matter.one(1e-7, 1e-10)).project(poses).channels.square().sum().backward()
+    assert poses.sources is not None
+    assert poses.sources.grad is not None
+    assert bool(poses.sources.grad.any())

@@ -87,8 +87,8 @@ class GaussianStage:
 
     options: Gaussians
     name: str = "fit"
-    poor: list[SurfaceMesh | None] = field(default_factory=list, compare=False, repr=False)
-    """What `near_surfaces` gave up, as it explained the frames badly; None where there was nothing."""
+    poor: list[tuple[Scan, SurfaceMesh | None]] = field(default_factory=list, compare=False, repr=False)
+    """The frames and what `near_surfaces` gave up last, as it explained them badly; None where there was nothing."""
 
     def start(self, task: Task, before: Stored | None) -> Stored | Near:
         """What the fit begins with; of small frames where a network is asked, what it is without one, or its guess."""
@@ -175,7 +175,7 @@ class GaussianStage:
             return ways_of_guess(coarse, ways, options, surfaces, self._fitted)
 
         found, poor = coarse_surfaces(self._without_validation(task), first, surfaces, how)
-        self.poor.append(poor)
+        self.poor[:] = [(task.scan, poor)]
         return found
 
     def solved(self, task: Task) -> GaussianCloud:

@@ -105,8 +105,8 @@ class Sphere:
         _, matrix, _, sums = self._equations()
         last = AXES + 1 + int(self.unknowns[AXES:].nonzero().max())
         matrix, sums = matrix[:last, :last], sums[:last]
-        inverse = torch.linalg.inv(matrix + LEAST * torch.diag(matrix.diag().clamp_min(float(matrix.diag().max()))))
-        return math.sqrt(float(sums @ inverse @ sums))
+        regular = matrix + LEAST * matrix.diag().max() * torch.eye(last, dtype=matrix.dtype)
+        return math.sqrt(float(sums @ torch.linalg.solve(regular, sums)))
 
     def _equations(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Units of the unknowns, and in these the second derivatives, minus the gradient, and the slopes of the sum."""

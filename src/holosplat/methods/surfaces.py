@@ -127,9 +127,9 @@ class BodiesStage(GaussianStage):
         that have taken turns with a volume."""
         how = self.options.coarse
         if not is_noisy(task, self.options):
-            if not self.poor:  # of a run that was resumed
+            if not (self.poor and self.poor[0][0] is task.scan):  # of a run that was resumed
                 self.near_surfaces(task, self.surfaces)
-            return self.poor[-1]
+            return self.poor[0][1]
         if self._missing(cloud, task) <= how.missing_matter:
             return None
         seen = self._without_validation(task)

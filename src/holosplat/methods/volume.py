@@ -74,15 +74,16 @@ class SmoothVolume(Method):
     """Iterations of a round."""
     max_voxels: int = 20_000_000
     """Frames are binned rather than having more voxels than this."""
-    told: tuple[Signed, ...] = ()
+    known_total: tuple[Signed, ...] = ()
     """Total δ of spherical matter, and the standard error of that [m³], where something else than frames tells them,
     as the other times of a series do; empty: nothing does."""
 
     def __post_init__(self) -> None:
         at_least(self, 1, "max_voxels", "loose")
         sizes = all(factor >= 2 for factor in self.coarser) and list(self.coarser) == sorted(self.coarser, reverse=True)
-        told = len(self.told) in (0, 2) and all(error > 0 for error in self.told[1:])
-        require(told, f"told must be a total and its positive standard error, or empty, but it is {self.told}.")
+        known = len(self.known_total) in (0, 2) and all(error > 0 for error in self.known_total[1:])
+        said = f"known_total must be a total and its positive standard error, or empty, but it is {self.known_total}."
+        require(known, said)
         require(sizes, f"coarser must be whole numbers from 2 on, the largest first, but it is {self.coarser}.")
 
     def stages(self) -> tuple[Stage, ...]:
@@ -137,8 +138,10 @@ class SmoothStage:
         known = task.prior.materials if len(task.prior.materials) > 1 else ()
         plan = SmoothPlan(scan, start, noise, task.prior.fixes_ratio, light, *how, backend, known)
         if task.prior.spherical:
-            return SphericalFit(plan.frames(1), start, backend, task.prior.lower, options.told)
-        require(not options.told, "told is of spherical matter, but the matter is of any shape; leave it.")
+            return SphericalFit(plan.frames(1), start, backend, task.prior.lower, options.known_total)
+        require(
+            not options.known_total, "known_total is of spherical matter, but the matter is of any shape; leave it."
+        )
         return SmoothFit(plan)
 
 

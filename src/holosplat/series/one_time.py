@@ -147,7 +147,7 @@ def retry_time(
     """
     began, folder, begun = time.perf_counter(), own.folder, "conserved" if told else "back"
     method = Continued.of(settings.method, after.folder.object.resolve(), settings.warm.effort)
-    method = replace(method, volume=replace(method.volume, told=tuple(told)))
+    method = replace(method, volume=replace(method.volume, known_total=tuple(told)))
     other, noted = RunFolder(folder.path.with_name(f"{folder.path.name}.{begun}")), f"{begun}.json"
     if (folder.path / noted).is_file():
         said = read_json(folder.path / noted)
