@@ -241,7 +241,7 @@ def test_small_bodies_beside_a_large_one_are_not_lost():
     task = task_of(scan_of(body(12.0), *specks))
     stage = GaussianStage(quick())
     assert stage.coarse_surfaces(task, SurfaceOptions()) is None
-    (poor,) = stage.poor  # the large body alone
+    ((_, poor),) = stage.poor  # the large body alone
     assert poor is not None
     assert unexplained(poor, task.scan, SurfaceOptions()) > quick().coarse.missing
 
