@@ -16,18 +16,20 @@ from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
 from holosplat.fit.problem import Schedule
 from holosplat.geometry import Views
-from holosplat.materials import HAEMOGLOBIN
-from holosplat.matter import MaterialPrior
+from holosplat.inference import Decision
+from holosplat.materials import HAEMOGLOBIN, WATER
+from holosplat.matter import MaterialPrior, Matter
 from holosplat.mesh import TriangleMesh
 from holosplat.methods import Gaussians, SurfaceOptions, Surfaces, Task
-from holosplat.methods.coarse import CoarseToFine, Way, begun_surfaces, first_of, missing_matter
-from holosplat.methods.first_surfaces import first_surfaces, is_noisy, surfaces_of_volume
+from holosplat.methods.coarse import CoarseToFine, Way, begun_surfaces, first_of, missing_matter, settled
+from holosplat.methods.cross_validation import BY_VIEWS
+from holosplat.methods.first_surfaces import first_surfaces, is_noisy, surfaces_of_volume, with_missing_bodies
 from holosplat.methods.gaussian_options import FitOptions
 from holosplat.methods.illumination import prepared
 from holosplat.methods.method import quiet
 from holosplat.methods.start import cloud_of_surfaces
 from holosplat.methods.surface_fit import FINEST, Extraction, SurfaceFit, extract_surfaces
-from holosplat.methods.surfaces import BodiesStage
+from holosplat.methods.surfaces import MORE, BodiesStage
 from holosplat.optics.background import LightOptions
 from holosplat.representations import SurfaceMesh
 from holosplat.scan import Exposures
@@ -124,6 +126,12 @@ def test_without_much_noise_surfaces_take_turns_with_what_explains_badly(monkeyp
     assert turns(before) is None
 
 
+@pytest.fixture
+def nothing_missing(monkeypatch):
+    """Bodies that are missing are for other tests."""
+    monkeypatch.setattr("holosplat.methods.surfaces.with_missing_bodies", lambda *given: None)
+
+
 EXPLAINED = replace(OPTIONS, coarse=replace(OPTIONS.coarse, missing_matter=0.3))
 """What so few noisy pixels tell."""
 
@@ -136,6 +144,7 @@ def best_cut(task: Task, count: int, options: Gaussians = EXPLAINED) -> tuple[Su
     return found, len(cuts)
 
 
+@pytest.mark.usefixtures("nothing_missing")
 def test_gaussians_that_explain_the_frames_are_cut(noisy, monkeypatch):
     monkeypatch.setattr("holosplat.methods.surfaces.begun_surfaces", lambda *given: pytest.fail("not asked for"))
     found, cuts = best_cut(noisy, 4)
@@ -156,6 +165,7 @@ def test_gaussians_that_lost_cells_give_way_to_the_volume(of_two):
     assert error(found) < 0.25 < error(mesh_of(3))
 
 
+@pytest.mark.usefixtures("nothing_missing")
 def test_of_two_that_explain_little_the_better_is_taken(noisy, monkeypatch):
     monkeypatch.setattr("holosplat.methods.surfaces.begun_surfaces", lambda *given: mesh_of(1))
     found, _ = best_cut(noisy, 3)
@@ -165,6 +175,7 @@ def test_of_two_that_explain_little_the_better_is_taken(noisy, monkeypatch):
     assert torch.equal(found.vertices, mesh_of(1).vertices)
 
 
+@pytest.mark.usefixtures("nothing_missing")
 def test_gaussians_without_a_surface_give_way(noisy, monkeypatch):
     monkeypatch.setattr("holosplat.methods.surfaces.begun_surfaces", lambda *given: mesh_of(2))
 
@@ -179,6 +190,7 @@ def test_gaussians_without_a_surface_give_way(noisy, monkeypatch):
         stage.best_cut(noisy, cloud, none)
 
 
+@pytest.mark.usefixtures("nothing_missing")
 @pytest.mark.parametrize(("poor", "cut"), [(4, 2), (2, 4)], ids=["of the volume", "of Gaussians"])
 def test_of_the_surfaces_of_clean_frames_those_that_explain_more_are_taken(poor, cut, monkeypatch):
     """Gaussians that began because surfaces explained the frames badly may explain them worse: then these are taken."""
@@ -191,6 +203,7 @@ def test_of_the_surfaces_of_clean_frames_those_that_explain_more_are_taken(poor,
     assert len(stage.best_cut(clean, cloud, lambda how: mesh_of(cut)).faces) == len(mesh_of().faces)
 
 
+@pytest.mark.usefixtures("nothing_missing")
 def test_where_first_surfaces_explained_clean_frames_there_are_no_others(monkeypatch):
     monkeypatch.setattr(BodiesStage, "near_surfaces", lambda *given: pytest.fail("it was asked"))
     clean = task_of(1e7)
@@ -199,6 +212,7 @@ def test_where_first_surfaces_explained_clean_frames_there_are_no_others(monkeyp
     assert torch.equal(stage.best_cut(clean, cloud, lambda how: mesh_of(2)).vertices, mesh_of(2).vertices)
 
 
+@pytest.mark.usefixtures("nothing_missing")
 @pytest.mark.parametrize("there", [True, False])
 def test_a_resumed_run_of_clean_frames_makes_its_first_surfaces_anew(there, monkeypatch):
     def near(stage: BodiesStage, task: Task, surfaces: SurfaceOptions) -> None:
@@ -209,11 +223,64 @@ def test_a_resumed_run_of_clean_frames_makes_its_first_surfaces_anew(there, monk
     assert len(found.faces) == len(mesh_of(4 if there else 2).faces)
 
 
+@pytest.mark.usefixtures("nothing_missing")
 def test_surfaces_of_a_random_start_have_no_rivals_but_finer_ones(monkeypatch):
     monkeypatch.setattr("holosplat.methods.surfaces.begun_surfaces", lambda *given: pytest.fail("not asked for"))
     monkeypatch.setattr(BodiesStage, "near_surfaces", lambda *given: pytest.fail("not asked for"))
     at_random = replace(EXPLAINED, start="random")
     assert best_cut(task_of(2000.0), 1, at_random)[1] == 2
+
+
+# --- missing bodies -----------------------------------------------------------------------------------------
+
+
+def test_a_body_that_is_missing_joins(noisy, monkeypatch):
+    """Without a volume of all matter, one of four cells comes out of what three leave of the frames, in its place."""
+    monkeypatch.setattr("holosplat.methods.surfaces.begun_surfaces", lambda *given: None)
+    told = list[Decision]()
+    task = replace(noisy, on_start=lambda decision, guess: told.append(decision))
+    found, _ = best_cut(task, 3)
+    assert len(found.bodies()) == 4
+    assert error(found) < 0.3 * error(mesh_of(3))
+    assert (told[-1].name, told[-1].choice, told[-1].by) == ("surfaces", MORE, BY_VIEWS)
+
+
+def test_where_none_is_missing_none_joins(noisy):
+    found, _ = best_cut(noisy, 4)
+    assert torch.equal(found.vertices, mesh_of().vertices)
+
+
+def test_a_body_that_unseen_views_do_not_show_does_not_join(noisy, monkeypatch):
+    """Training frames may prefer one that makes up for their noise."""
+    monkeypatch.setattr("holosplat.methods.surfaces.begun_surfaces", lambda *given: None)
+    views, told = len(noisy.scan), list[Decision]()
+
+    def bodies(task: Task, *rest) -> tuple[float, SurfaceMesh]:
+        return 0.2, mesh_of(4 if len(task.scan) == views else 1)
+
+    monkeypatch.setattr("holosplat.methods.surfaces.with_missing_bodies", bodies)
+    task = replace(noisy, on_start=lambda decision, guess: told.append(decision))
+    found, _ = best_cut(task, 3)
+    assert torch.equal(found.vertices, mesh_of(3).vertices)
+    assert [each.choice for each in told[-2:]] == [MORE, "as found"]
+
+
+def test_what_is_too_much_is_not_made_up_for_elsewhere(noisy):
+    """Beside surfaces of half as much matter again, whose residual is of both signs, no body is added that lasts."""
+    wide = mesh_of()
+    grown = [(body.vertices - body.vertices.mean(0)) * 1.15 + body.vertices.mean(0) for body in wide.bodies()]
+    large = surfaces(*(replace(body, vertices=at) for body, at in zip(wide.bodies(), grown)), unit=PITCH)
+    assert error(large) > 0.3
+    made = with_missing_bodies(noisy, large, HOW, OPTIONS.coarse)
+    assert made is None or error(made[1]) < 1.02 * error(settled(noisy, large, HOW, OPTIONS.coarse))
+
+
+def test_bodies_of_several_materials_get_none(noisy):
+    two = replace(mesh_of(), matter=Matter.several(MATTER, WATER.delta_beta(20.0)))
+    assert with_missing_bodies(noisy, two, HOW, OPTIONS.coarse) is None
+
+
+# --- thin bodies --------------------------------------------------------------------------------------------
 
 
 def rods(radius: float) -> tuple[Task, SurfaceMesh]:

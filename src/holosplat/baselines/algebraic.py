@@ -168,29 +168,38 @@ def sirt(
     options: Algebraic = Algebraic(),
     missing: Tensor | None = None,
     two_sided: bool = False,
+    start: Tensor | None = None,
 ) -> Tensor:
-    """Occupancy [Z, Y, X] on `grid` from thickness `lines` [V, H, W] in metres, by SIRT from zero; float32.
+    """Occupancy [Z, Y, X] on `grid` from thickness `lines` [V, H, W] in metres, by SIRT; float32.
 
     `x ← x + ω C Aᵀ R (b - A x)` with R and C one over the sums of A's rows and columns (Gregor & Benson 2008, eq. 2),
-    then the bounds: `upper`, and zero if `options.nonnegative` and not `two_sided`.
+    then the bounds: `upper`, and zero if `options.nonnegative` and not `two_sided`. It starts from zero, or from
+    `start` [Z, Y, X]; then `lines` are those beyond its own.
     """
     top, rays = checked_upper(upper), rays_of(lines, views, grid, missing=missing)
     lowest = 0.0 if options.nonnegative and not two_sided else None
     with memory_kept():
-        return _simultaneous(rays, (lowest, top), on_progress, options)
+        return _simultaneous(rays, (lowest, top), on_progress, options, start)
 
 
 def _simultaneous(
-    rays: Rays, bounds: tuple[float | None, float | None], on_progress: Advance, options: Algebraic
+    rays: Rays,
+    bounds: tuple[float | None, float | None],
+    on_progress: Advance,
+    options: Algebraic,
+    start: Tensor | None,
 ) -> Tensor:
-    projector = rays.projector
+    projector, measured = rays.projector, rays.measured
     volume = torch.zeros(projector.array_shape)
+    if start is not None:
+        volume = projector.volume_in(start).clone()
+        measured = measured + projector.project(volume)
     known = torch.ones_like(rays.measured) if rays.known is None else rays.known
     per_ray = _reciprocal(projector.project(torch.ones_like(volume))).mul_(known)
     per_voxel = _reciprocal(projector.backproject(known)).mul_(options.relaxation)
     for done in range(options.sweeps):
         on_progress(done / options.sweeps)
-        missing = (rays.measured - projector.project(volume)).mul_(per_ray)
+        missing = (measured - projector.project(volume)).mul_(per_ray)
         volume.addcmul_(per_voxel, projector.backproject(missing))
         bounded(volume, *bounds)
     return projector.volume_out(volume)

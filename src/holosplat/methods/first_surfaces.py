@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from itertools import combinations
 
 import torch
 from torch import Tensor
 
 from ..baselines import holographic_tv
-from ..baselines.holographic_tv import agreed
+from ..baselines.algebraic import Algebraic, sirt
+from ..baselines.holographic_tv import Correction, agreed
 from ..baselines.two_materials import Shares, at_one_ratio
 from ..checks import InputError, require
 from ..geometry import Grid
 from ..inference import Score, select
-from ..matter import Matter
+from ..matter import DeltaBeta, Matter
 from ..optics.noise import noise_share
 from ..representations import GaussianCloud, SurfaceMesh, VoxelGrid
-from .coarse import Way, settled, unexplained
+from .coarse import CoarseToFine, Way, settled, unexplained
 from .gaussian_options import GaussianOptions
 from .keeper import BY
 from .method import Task
@@ -212,6 +215,49 @@ def cut_as_seen(task: Task, volume: Tensor, grid: Grid, matter: Matter, surfaces
             tried.append((_left(task, cut, surfaces), cut))
     require(len(tried) > 0, "the volume holds no surface.")
     return min(tried, key=lambda one: one[0])[1]
+
+
+MISSING = "surfaces: missing bodies"
+
+
+def with_missing_bodies(
+    task: Task, found: SurfaceMesh, surfaces: SurfaceOptions, how: CoarseToFine, levels: Sequence[float] = LEVELS
+) -> tuple[float, SurfaceMesh] | None:
+    """`found` of one material and bodies that the frames of `task` show beside it, after some steps, and the level that
+    cut these out; None where the frames show none.
+
+    The thickness that explains what `found` leaves of the frames (`Correction`) changes its occupancy within 0 and 1,
+    by SIRT: what is too much is taken away where it is, and is not made up for by matter elsewhere. Where occupancy
+    is added, a body is missing, down to a voxel. Few views and noise make it faint, so that `levels`, from the lowest
+    on as long as less of the frames is left, are shares of the largest addition.
+    """
+    if not found.matter.single:
+        return None
+    matter, grid = DeltaBeta(found.matter.delta, found.matter.beta), Grid.of_views(task.scan.views)
+    left = task.scan.left(frames_of(found, task.scan, surfaces.fit))
+    lines, shares = Correction(task.scan, matter, noise=task.noise)(left), found.shares(grid)[0].float().cpu()
+    kept = {"options": Algebraic(nonnegative=True), "missing": task.scan.gaps, "start": shares}
+    added = sirt(lines, task.scan.views, grid, 1.0, partial(task.on_progress, MISSING), **kept) - shares
+    best, least, largest = None, math.inf, float(added.max())
+    for level in levels if largest > 0 else ():
+        every = replace(surfaces.extraction, level=level, least_volume=1.0)
+        try:
+            bodies = cut_surfaces(added / largest, grid, task.scan.views.finest, found.matter, every)
+        except InputError:  # none has the volume of a voxel
+            break
+        more = settled(task, _joined(found, bodies), surfaces, how)
+        if (left_over := _left(task, more, surfaces)) >= least:
+            break
+        best, least = (level, more), left_over
+    return best
+
+
+def _joined(one: SurfaceMesh, other: SurfaceMesh) -> SurfaceMesh:
+    """Both, in the unit of `one`."""
+    scale = other.unit_length / one.unit_length
+    vertices = torch.cat([one.vertices.cpu(), scale * other.vertices.cpu()])
+    faces = torch.cat([one.faces.cpu(), other.faces.cpu() + len(one.vertices)])
+    return SurfaceMesh(vertices, faces, one.unit_length, one.matter, one.lines)
 
 
 def _left(task: Task, found: SurfaceMesh, surfaces: SurfaceOptions) -> float:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cache, partial
 from typing import ClassVar
 
 from ..checks import InputError, require
@@ -16,7 +16,8 @@ from ..progress import Progress
 from ..representations import GaussianCloud, Stored, SurfaceMesh
 from ..scan import Scan
 from .coarse import CoarseToFine, Way, begun_surfaces, coarse_surfaces, missing_matter, on_pixels, settled
-from .first_surfaces import first_surfaces, is_noisy, surfaces_of_volume
+from .cross_validation import Folds
+from .first_surfaces import first_surfaces, is_noisy, surfaces_of_volume, with_missing_bodies
 from .gaussians import Gaussians, GaussianStage
 from .keeper import BY
 from .method import Method, Near, Stage, Task, quiet, run_quietly
@@ -66,6 +67,9 @@ class Surfaces(SurfaceOptions, Method):
         return replace(super().with_effort(effort), gaussians=self.gaussians.with_effort(effort))
 
 
+MORE = "with missing bodies"
+
+
 @dataclass(frozen=True)
 class BodiesStage(GaussianStage):
     """What surfaces begin with: those of coarse pixels where these show the bodies, and Gaussians elsewhere."""
@@ -95,7 +99,7 @@ class BodiesStage(GaussianStage):
     def best_cut(self, task: Task, cloud: GaussianCloud, cut: Cut) -> SurfaceMesh:
         """The surfaces that `cut` gets out of `cloud`; or, if they explain more by the policy of `select`, of small
         frames those of a first volume, where there are any, and, where much matter is missing from the first after some
-        steps, those cut on finer voxels.
+        steps, those cut on finer voxels. Bodies that are missing from them join them (`_with_missing_bodies`).
 
         Marching cubes at one half leave out what is not much thicker than their voxels, and surfaces that are missing
         do not grow. Errors: those of `cut`, where there are no others.
@@ -112,15 +116,47 @@ class BodiesStage(GaussianStage):
             if not found:
                 raise
             return found["of a volume"]
-        if not found and self._missing(first, task) <= most:
-            return first
         own = settled(seen, first, self.surfaces, steps)
-        if self._missing(own, task) > most:
-            found["on finer voxels"] = settled(seen, cut(self.surfaces.extraction.finer()), self.surfaces, steps)
-        found = {"of Gaussians": own, **found}
-        decision = select("surfaces", tuple(found), lambda name, _: self._score(found[name], seen), by=BY)
-        alone = decision.choice == "of Gaussians" and "of a volume" not in found
-        return first if alone else found[decision.choice]
+        if found or self._missing(first, task) > most:
+            if self._missing(own, task) > most:
+                found["on finer voxels"] = settled(seen, cut(self.surfaces.extraction.finer()), self.surfaces, steps)
+            chosen = self._chosen({"of Gaussians": own, **found}, seen)
+            if chosen is not own or "of a volume" in found:
+                first = own = chosen
+        return self._with_missing_bodies(seen, own, steps) or first
+
+    def _chosen(self, found: Mapping[str, SurfaceMesh], task: Task) -> SurfaceMesh:
+        """The surfaces that explain most of the frames by the policy of `select`, the null first."""
+        decision = select("surfaces", tuple(found), lambda name, _: self._score(found[name], task), by=BY)
+        task.on_start(decision, None)
+        return found[decision.choice]
+
+    def _with_missing_bodies(self, task: Task, found: SurfaceMesh, steps: CoarseToFine) -> SurfaceMesh | None:
+        """`found` and bodies missing from it, if these explain more of the training frames, and then of views that
+        were set aside from both; else None. Training frames alone may prefer bodies that make up for noise."""
+
+        own = settled(task, found, self.surfaces, steps)
+        joined = with_missing_bodies(task, found, self.surfaces, steps)
+        if joined is None or self._chosen({"as found": own, MORE: joined[1]}, task) is own:
+            return None
+        folds, (level, more) = Folds.of(task.scan, binning=1), joined
+
+        @cache
+        def scores(fold: int) -> dict[str, Score]:
+            seen, unseen = folds.split(fold)
+            part = replace(task.of_views(folds.kept(fold)), scan=seen)
+            null = settled(part, found, self.surfaces, steps)
+            _, other = with_missing_bodies(part, found, self.surfaces, steps, (level,)) or (level, null)
+            return {
+                name: self._score(each, replace(task, scan=unseen))
+                for name, each in (("as found", null), (MORE, other))
+            }
+
+        decision = select(
+            "surfaces", ("as found", MORE), lambda name, fold: scores(fold)[name], folds.count, by=folds.by
+        )
+        task.on_start(decision, None)
+        return more if decision.choice == MORE else None
 
     def _of_first_volume(self, task: Task, cloud: GaussianCloud) -> SurfaceMesh | None:
         """Surfaces without which Gaussians began, as they explain the frames badly; in noise, where Gaussians do, those

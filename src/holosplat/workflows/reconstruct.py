@@ -219,7 +219,7 @@ def load_reconstruction(folder: RunFolder) -> Reconstruction:
 class _FolderRun(Run):
     """A run whose folder is kept up to date: config.json, metrics, and a checkpoint in each fit. Ctrl-C ends a fit.
 
-    config: entries of config.json; start: the decision on what a fit starts from, where a network was asked
+    config: entries of config.json; start: the decisions on what fits start from
     """
 
     def __init__(self, folder: RunFolder | None, on_progress: FitProgress, on_state: FitState | None) -> None:
@@ -242,7 +242,7 @@ class _FolderRun(Run):
 
     def start_at(self, decision: Decision, guess: GuessedMatter | None) -> None:
         """Take in what a fit starts from."""
-        self.start, self._guess = (decision,), guess
+        self.start, self._guess = (*self.start, decision), guess or self._guess
 
     def make_folder(self, backend: str) -> None:
         """Make the folder, once there is something to put in it."""
