@@ -190,11 +190,6 @@ class NeuralField:
         """How large the field is, in words."""
         return f"a field of {sum(p.numel() for p in self._weights.values())} weights"
 
-    @property
-    def stored_bytes(self) -> int:
-        """Size of the weights as float16, and of the mask in bits."""
-        return 2 * sum(p.numel() for p in self._weights.values()) + self.mask.numel() // 8
-
     def enclosing_grid(self, most_voxels: int) -> Grid:
         """The grid of the field, whatever its size."""
         return self.grid

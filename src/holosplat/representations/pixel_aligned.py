@@ -138,12 +138,6 @@ class PixelAlignedField:
         weights = sum(weight.numel() for weight in self.weights.values())
         return f"a field of {weights} weights on {len(self.images)} views"
 
-    @property
-    def stored_bytes(self) -> int:
-        """Size of the weights and images as float16, and of the mask in bits."""
-        weights = sum(weight.numel() for weight in self.weights.values())
-        return 2 * (weights + self.images.numel()) + self.mask.numel() // 8
-
     def enclosing_grid(self, most_voxels: int) -> Grid:
         """The grid of the field, whatever its size."""
         return self.grid

@@ -236,11 +236,6 @@ class SpaceTimeField:
         flow = "without divergence" if self.options.velocity.solenoidal else "with free components"
         return f"a field of {x} × {y} × {z} nodes and {self.basis.count} in time, and a flow {flow}"
 
-    @property
-    def stored_bytes(self) -> int:
-        """Size of the parameters as a run folder stores them, float32."""
-        return 4 * sum(p.numel() for p in self.parameters().values())
-
     def enclosing_grid(self, most_voxels: int) -> Grid:
         """The grid itself, whatever its size."""
         return self.grid

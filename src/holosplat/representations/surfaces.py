@@ -107,11 +107,6 @@ class SurfaceMesh:
         there = device(backend)
         return self._with(self.vertices.to(there), self.faces.to(there), backend)
 
-    @property
-    def stored_bytes(self) -> int:
-        """Size of vertices as float32 and faces as int32."""
-        return 4 * (self.vertices.numel() + self.faces.numel())
-
     def enclosing_grid(self, most_voxels: int) -> Grid:
         """A grid around all vertices, of `unit_length` a voxel, or coarser where those would be over `most_voxels`."""
         return Grid.around(self.vertices.detach().cpu().numpy(), self.unit_length, most_voxels)
@@ -279,11 +274,6 @@ class MovingSurfaces:
         bodies = self.with_parameters({})
         bodies.backend = in_main_memory(backend)
         return bodies
-
-    @property
-    def stored_bytes(self) -> int:
-        """Size of coefficients as float32 and faces as int32."""
-        return 4 * (self.coefficients.numel() + self.faces.numel())
 
     def enclosing_grid(self, most_voxels: int) -> Grid:
         """A grid around all bodies at all times, as of `SurfaceMesh`: paths do not leave the hull of coefficients."""
