@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from holosplat.beamline.declaration import Case
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -16,7 +17,6 @@ from holosplat.align.derivatives import blurred, in_pixels, projections
 from holosplat.align.find import align_views
 from holosplat.align.initial_geometry import shifts_by_mass
 from holosplat.baselines import TOMOGRAPHIES
-from holosplat.beamline.declared.declaration import Case
 from holosplat.checks import require
 from holosplat.geometry import Grid, Views
 from holosplat.matter import Known, MaterialPrior, Matter
