@@ -160,6 +160,11 @@ def binned_measured(frames: np.ndarray, missing: np.ndarray | None, factor: int)
     return np.where(none, binned(frames, factor), sums / np.where(none, 1, known)), none if none.any() else None
 
 
+def evenly(count: int, most: int) -> np.ndarray:
+    """At most `most` of the numbers from 0 to `count` - 1, evenly spread, the first and the last among them."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
+
+
 def parts_of(frames: np.ndarray | Frames, count: int) -> Iterator[slice]:
     """Slices of `count` numbers, each of so many frames as have about `BLOCK_BYTES`, at least one."""
     at_once = max(1, BLOCK_BYTES // max(1, 4 * frames.shape[1] * frames.shape[2]))

@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from ..checks import InputError, at_least, in_range, require
+from ..frames import evenly
 from ..geometry import Views, rotation_y
 from ..inference import Compared, Decision
 from ..optics.background import LightOptions
@@ -216,7 +217,7 @@ def sinograms_of(scan: Scan, options: AxisOptions, ratio: float | None, light: L
         "the axis is that of views which turn about the object's y axis alone, but these do not; align without "
         "--axis-only.",
     )
-    chosen = np.unique(np.linspace(0, len(scan) - 1, min(len(scan), options.views)).round().astype(int))
+    chosen = evenly(len(scan), options.views)
     require(
         len(chosen) >= FEWEST_VIEWS,
         f"an axis needs {FEWEST_VIEWS} views at least, but there are {len(chosen)}; align without --axis-only.",

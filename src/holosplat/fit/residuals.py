@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ..checks import finite, require
+from ..frames import evenly
 from ..memory import memory_kept
 from ..model import Alignment, Instrument, LightField, Model, smooth_modes
 from ..ranges import Weight, checked_dataclass
@@ -199,7 +200,7 @@ def residuals(
         f"measured frames must have the shape {wanted} of the exposures, but they have {tuple(measured.shape)}.",
     )
     rings = Rings.of(views.shape, views.finest)
-    probed = np.unique(np.linspace(0, count - 1, min(count, MOST_PROBED)).round().astype(int))
+    probed = evenly(count, MOST_PROBED)
     spectra, sampling, changes = list[Tensor](), list[Tensor](), list[Tensor]()
     for i in range(count):
         one = said.view(i)
