@@ -16,6 +16,7 @@ from holosplat.geometry import Grid, Views
 from holosplat.progress import Advance
 from holosplat.projectors.voxels import rows_match
 from holosplat.ranges import Positive, Signed, checked_dataclass
+from holosplat.rotations import angles_about_y
 
 
 @checked_dataclass
@@ -61,7 +62,7 @@ def svmbir_volume(
     with tempfile.TemporaryDirectory() as cache:  # its system matrices, which it keeps for ever otherwise
         image = program.recon(
             (lines.float() / pitch).numpy(),
-            -np.arctan2(views.rotations[:, 0, 2], views.rotations[:, 0, 0]),
+            -angles_about_y(views.rotations),
             num_rows=rows,
             num_cols=columns,
             roi_radius=float(np.hypot(rows, columns)),  # all of the square, not its inscribed circle
