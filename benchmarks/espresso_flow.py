@@ -28,7 +28,6 @@ from holosplat.io.vtk import read_meshes
 from holosplat.mesh import TriangleMesh
 from holosplat.specimens.flow.suspension import Channel, Medium, State, Stepper, Suspension
 from holosplat.specimens.membrane.model import Elasticity, Membrane
-from holosplat.specimens.membrane.rest import elongation, shape_change
 from holosplat.specimens.repair import closed
 
 matplotlib.use("Agg")
@@ -40,6 +39,32 @@ WALL = 1e-6
 TOLERANCE = 1e-3
 VOLUME = 3e3
 """Our modulus of volume [N/m²]; ESPResSo's, 900, would let 1 % leak through the finite mesh."""
+
+
+def gyration_axes(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Root-mean-square extents [..., 3] [m] along the principal axes, rising, and these axes [..., 3, 3] (columns)."""
+    local = nodes - nodes.mean(axis=-2, keepdims=True)
+    values, axes = np.linalg.eigh(np.einsum("...pi,...pj->...ij", local, local) / nodes.shape[-2])
+    return np.sqrt(np.maximum(values, 0)), axes
+
+
+def elongation(nodes: np.ndarray) -> np.ndarray:
+    """(longest - middle)/(longest + middle) [...] of the extents: 0 for a cell at rest, towards 1 for a thread."""
+    extents, _ = gyration_axes(nodes)
+    return (extents[..., 2] - extents[..., 1]) / (extents[..., 2] + extents[..., 1])
+
+
+def shape_change(nodes: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Root-mean-square distance [...] [m] of nodes from a `reference` [..., P, 3], moved and turned to fit best.
+
+    The rotation is Kabsch's (1976, Acta Cryst. A 32, 922).
+    """
+    first = nodes - nodes.mean(axis=-2, keepdims=True)
+    second = np.broadcast_to(reference - reference.mean(axis=-2, keepdims=True), first.shape)
+    left, values, right = np.linalg.svd(np.einsum("...pi,...pj->...ij", first, second))
+    values[..., 2] *= np.sign(np.linalg.det(left) * np.linalg.det(right))
+    squares = (first**2).sum((-2, -1)) + (second**2).sum((-2, -1)) - 2 * values.sum(-1)
+    return np.sqrt(np.maximum(squares, 0) / nodes.shape[-2])
 
 
 @dataclass(frozen=True)

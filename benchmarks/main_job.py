@@ -30,11 +30,11 @@ from rows import read, write
 from scipy.spatial.transform import Rotation
 
 import holosplat as hs
-from holosplat.beamline.declared.declaration import Between
 from holosplat.methods import METHODS
 from holosplat.methods.surface_fit import oversampling
 from holosplat.workflows.evaluate import Scores, score_object
 from holosplat.workflows.provenance import environment
+from holosplat_bench.suite.declared import Between
 
 HAEMOGLOBIN = hs.materials.HAEMOGLOBIN.delta_beta(20.0)
 

@@ -32,7 +32,7 @@ from holosplat.geometry import Grid
 from holosplat.mesh import TriangleMesh
 from holosplat.metrics import volume_scores
 from holosplat.motion.fit import MotionFit
-from holosplat.motion.measures import area, standard_errors
+from holosplat.motion.measures import standard_errors
 from holosplat.motion.track import Followed, TrackOptions, follow
 from holosplat.representations import MovingSurfaces
 from holosplat.specimens.red_cells import icosphere
@@ -200,7 +200,7 @@ def identities(found: MovingSurfaces, cells: MeshSeries) -> np.ndarray:
         away = np.median(np.linalg.norm(ours - way[:, None], axis=-1)[whole], axis=0)
         best = int(away.argmin())
         shares = sizes[whole, best] / np.array([mesh.volume for mesh in own])[whole]
-        areas = np.array([area(meshes[t][best]) / area(own[t]) for t in np.flatnonzero(whole)])
+        areas = np.array([meshes[t][best].area / own[t].area for t in np.flatnonzero(whole)])
         rows.append((best, away[best], shares.mean() - 1, shares.std(), areas.std()))
     return np.array(rows)
 

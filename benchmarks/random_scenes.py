@@ -22,11 +22,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from machine import commit
-from rows import read, write
-
-import holosplat as hs
-from holosplat.beamline.declared.declaration import (
+from holosplat.beamline.declaration import (
     Beam,
     Case,
     Declaration,
@@ -36,6 +32,10 @@ from holosplat.beamline.declared.declaration import (
     Substance,
     case_of,
 )
+from machine import commit
+from rows import read, write
+
+import holosplat as hs
 from holosplat.beamline.light import UnevenLight
 from holosplat.geometry import Grid
 from holosplat.metrics import volume_scores

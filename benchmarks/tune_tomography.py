@@ -28,11 +28,11 @@ import holosplat as hs
 from holosplat.baselines.algebraic import Algebraic, Ramp, art, filtered_backprojection, sirt
 from holosplat.baselines.tomography import TOMOGRAPHIES, TotalVariation, total_variation
 from holosplat.matter import Matter
-from holosplat.methods.per_view import Mbir, svmbir_volume
 from holosplat.metrics import image_scores, intensity_range, volume_scores
 from holosplat.optics.retrieval import RETRIEVALS
 from holosplat.optics.sampling import fringe_sampling
 from holosplat.representations.voxels import VoxelGrid
+from holosplat_bench.opponents.mbir import Mbir, svmbir_volume
 
 HAEMOGLOBIN = hs.materials.HAEMOGLOBIN.delta_beta(20.0)
 PITCH = 3.2e-6
@@ -80,7 +80,7 @@ OPTIONS: dict[str, tuple[Callable[..., torch.Tensor], list[Any]]] = {
     "sirt": (sirt, SIRT),
     "sirt-nonneg": (sirt, SIRT_NONNEG),
     "tv": (total_variation, TV),
-    "svmbir": (lambda *call, options: svmbir_volume(*call[:3], call[4], options=options).clamp(0, call[3]), MBIR),
+    "svmbir": (svmbir_volume, MBIR),
 }
 
 

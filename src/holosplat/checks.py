@@ -140,6 +140,13 @@ def shaped(field: str, array: np.ndarray, shape: tuple[int | None, ...]) -> np.n
     return array
 
 
+def require_shapes(label: str, given: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+    """`InputError` unless `given` holds the arrays that are `wanted`, of the same shapes; label: {} is one's name."""
+    for name in {**wanted, **given}:
+        want, got = (tuple(table[name].shape) if name in table else None for table in (wanted, given))
+        require(want == got, f"{label.format(name)} must have the shape {want}, but it has {got}.")
+
+
 def require_regular(path: str | Path, what: str) -> None:
     """`InputError` unless `path`, which must be `what`, is a regular file: a named pipe or a device may never end."""
     try:

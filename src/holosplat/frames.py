@@ -144,11 +144,18 @@ def binned(frames: np.ndarray, factor: int) -> np.ndarray:
 
     The cut is even on both sides, or one pixel more below and on the right.
     """
-    (h, w), shape = (n // factor for n in frames.shape[1:]), frames.shape[1:]
-    require(min(h, w) > 0, f"frames of {tuple(shape)} pixels cannot be binned by {factor}.")
-    top, left = ((n - m * factor) // 2 for n, m in zip(shape, (h, w)))
-    cut = frames[:, top : top + h * factor, left : left + w * factor]
-    return cut.reshape(len(frames), h, factor, w, factor).mean((2, 4))
+    shape = frames.shape[1:]
+    require(min(shape) >= factor, f"frames of {tuple(shape)} pixels cannot be binned by {factor}.")
+    top, left = (n % factor // 2 for n in shape)
+    return block_means(frames[:, top:, left:], factor)
+
+
+def block_means(images: np.ndarray, factor: int) -> np.ndarray:
+    """Means of images [..., H, W] over `factor × factor` pixels; rows and columns at the end that do not fill one are
+    cut."""
+    *before, h, w = images.shape
+    h, w = h // factor, w // factor
+    return images[..., : h * factor, : w * factor].reshape(*before, h, factor, w, factor).mean((-3, -1))
 
 
 def binned_measured(frames: np.ndarray, missing: np.ndarray | None, factor: int) -> Taken:
@@ -158,6 +165,18 @@ def binned_measured(frames: np.ndarray, missing: np.ndarray | None, factor: int)
     known = binned((~missing).astype(np.float32), factor)
     sums, none = binned(np.where(missing, 0, frames), factor), known == 0
     return np.where(none, binned(frames, factor), sums / np.where(none, 1, known)), none if none.any() else None
+
+
+def evenly(count: int, most: int) -> np.ndarray:
+    """At most `most` of the numbers from 0 to `count` - 1, evenly spread, the first and the last among them."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
+
+
+def rfft_weights(width: int) -> np.ndarray:
+    """[W//2 + 1] how many frequencies of real images, `width` = W pixels wide, each column of their `rfft2` stands for:
+    the conjugate half is not stored, beside columns that are their own conjugates."""
+    own = np.arange(width // 2 + 1) % (width / 2) == 0
+    return np.where(own, 1.0, 2.0)
 
 
 def parts_of(frames: np.ndarray | Frames, count: int) -> Iterator[slice]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -37,6 +38,11 @@ class TriangleMesh:
         return float(np.einsum("fi,fi->", a, np.cross(b, c)) / 6)
 
     @property
+    def area(self) -> float:
+        """Area of the surface [m²]."""
+        return float(np.linalg.norm(vector_areas(self), axis=1).sum())
+
+    @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corner `(x, y, z)` [m] of the bounding box."""
         return self.vertices.min(0), self.vertices.max(0)
@@ -64,6 +70,19 @@ class TriangleMesh:
     def transformed(self, rotation: np.ndarray, translation: np.ndarray) -> TriangleMesh:
         """The mesh moved to `rotation @ vertex + translation` ([3, 3], [3] in metres)."""
         return replace(self, vertices=self.vertices @ np.asarray(rotation).T + np.asarray(translation))
+
+
+def joined(meshes: Sequence[TriangleMesh], name: str = "mesh") -> TriangleMesh:
+    """All meshes as one, their vertices and faces one mesh after the other."""
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
+    faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts)])
+    return TriangleMesh(np.concatenate([mesh.vertices for mesh in meshes]), faces, name)
+
+
+def part_of(mesh: TriangleMesh, faces: np.ndarray, name: str) -> TriangleMesh:
+    """The mesh of `faces` [F, 3] and of those vertices alone that they name."""
+    used, index = np.unique(faces, return_inverse=True)
+    return TriangleMesh(mesh.vertices[used], index.reshape(-1, 3), name)
 
 
 def shell_labels(faces: np.ndarray, vertex_count: int) -> np.ndarray:
@@ -95,19 +114,27 @@ def winding_number(triangles: np.ndarray, point: np.ndarray) -> float:
     return float(abs(2 * np.arctan2(numerator, denominator).sum()) / (4 * np.pi))
 
 
+def vector_areas(mesh: TriangleMesh) -> np.ndarray:
+    """[F, 3] m²: normals of the triangles, as long as these are large."""
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
+    return 0.5 * np.cross(b - a, c - a)
+
+
 def areas(mesh: TriangleMesh) -> np.ndarray:
     """[P] m² around each vertex: a third of its triangles."""
-    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
-    found = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1) / 3
+    found = np.linalg.norm(vector_areas(mesh), axis=1) / 3
     return np.bincount(mesh.faces.ravel(), np.repeat(found, 3), minlength=len(mesh.vertices))
+
+
+def sums_of_areas(mesh: TriangleMesh) -> np.ndarray:
+    """[P, 3] m² at the vertices: the sums of `vector_areas` of the triangles around."""
+    corners, across = mesh.faces.ravel(), np.repeat(vector_areas(mesh), 3, axis=0)
+    return np.stack([np.bincount(corners, across[:, axis], len(mesh.vertices)) for axis in range(3)], axis=1)
 
 
 def normals(mesh: TriangleMesh) -> np.ndarray:
     """[P, 3] outward unit normals at the vertices, means of those of their triangles by area."""
-    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
-    found, across = np.zeros_like(mesh.vertices), np.cross(b - a, c - a)
-    for corner in range(3):
-        np.add.at(found, mesh.faces[:, corner], across)
+    found = sums_of_areas(mesh)
     return found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), np.finfo(float).tiny)
 
 

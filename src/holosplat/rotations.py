@@ -17,6 +17,11 @@ def rotation_y(angles_deg: np.ndarray | list[float]) -> np.ndarray:
     return np.stack([np.stack([c, o, s], -1), np.stack([o, i, o], -1), np.stack([-s, o, c], -1)], -2)
 
 
+def angles_about_y(rotations: np.ndarray) -> np.ndarray:
+    """Angles [V] in radians, from -π to π, of `rotation_y`, by where it turns the x axis of rotations [V, 3, 3]."""
+    return np.arctan2(rotations[:, 0, 2], rotations[:, 0, 0])
+
+
 def rotation_tilted(angles_deg: np.ndarray | list[float], tilts_deg: np.ndarray | list[float]) -> np.ndarray:
     """Rotation matrices [V, 3, 3] of angles [V] about y, tilted [V] out of the plane: `R = R_x(tilt) R_y(angle)`.
 

@@ -12,8 +12,8 @@ import torch
 from holosplat.baselines.algebraic import Algebraic, Ramp, filtered_backprojection, sirt
 from holosplat.checks import InputError, MissingError
 from holosplat.geometry import Grid, Views
-from holosplat.methods import per_view as other
 from holosplat.projectors.voxels import SliceProjector
+from holosplat_bench.opponents import mbir as other
 
 SIDE, ROWS = 49, 3
 ANGLES = np.arange(40) * 4.5
@@ -127,7 +127,9 @@ def test_svmbir_sees_what_we_see():
     grid = Grid.of_views(views)
     projector = SliceProjector(grid, views)
     lines = projector.lines_out(projector.project(projector.volume_in(volume)))
-    found = other.svmbir_volume(lines, views, grid, quiet, options=other.Mbir(snr_db=50, sharpness=0, iterations=100))
+    found = other.svmbir_volume(
+        lines, views, grid, None, quiet, options=other.Mbir(snr_db=50, sharpness=0, iterations=100)
+    )
     assert found.shape == grid.shape
     assert apart(found[:, 2].double().numpy(), truth) < 0.1  # its prior couples rows; a wrong sign would be above 1
     assert float(found[12:36, 0, 12:36].mean()) == pytest.approx(0.3, rel=0.1)
@@ -141,7 +143,9 @@ def test_svmbir_takes_a_shifted_detector():
     projector = SliceProjector(grid, views)
     volume = torch.from_numpy(truth).float()[:, None].repeat(1, ROWS, 1)
     lines = projector.lines_out(projector.project(projector.volume_in(volume)))
-    found = other.svmbir_volume(lines, views, grid, quiet, options=other.Mbir(snr_db=50, sharpness=0, iterations=100))
+    found = other.svmbir_volume(
+        lines, views, grid, None, quiet, options=other.Mbir(snr_db=50, sharpness=0, iterations=100)
+    )
     assert apart(found[:, 1].double().numpy(), truth) < 0.02
 
 
@@ -152,18 +156,18 @@ def test_what_svmbir_cannot_do_is_refused(monkeypatch):
     tilted = Views(views.rotations[:, [0, 2, 1]] * [[1], [1], [-1]], views.shifts, views.shape, PITCH)
     wobbling = Views(views.rotations, PITCH * np.eye(40, 2), views.shape, PITCH)
     with pytest.raises(InputError, match="svmbir needs views that turn about the y axis only"):
-        other.svmbir_volume(lines, tilted, grid, quiet)
+        other.svmbir_volume(lines, tilted, grid, None, quiet)
     with pytest.raises(InputError, match="svmbir needs"):
-        other.svmbir_volume(lines, wobbling, grid, quiet)
+        other.svmbir_volume(lines, wobbling, grid, None, quiet)
     with pytest.raises(InputError, match="rows along y are the detector's rows"):
-        other.svmbir_volume(lines, views, Grid.of_views(views, 2), quiet)
+        other.svmbir_volume(lines, views, Grid.of_views(views, 2), None, quiet)
     away = Grid(grid.shape, grid.voxel_size, (grid.origin[0] + PITCH, *grid.origin[1:]))
     with pytest.raises(InputError, match="its middle on the rotation axis, but it is 1 pixels off"):
-        other.svmbir_volume(lines, views, away, quiet)
+        other.svmbir_volume(lines, views, away, None, quiet)
 
 
 def test_without_svmbir_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "svmbir", None)
     views = views_at()
     with pytest.raises(MissingError, match=r"pip install 'holosplat\[bench\]'"):
-        other.svmbir_volume(as_thickness(disc_lines()), views, Grid.of_views(views), quiet)
+        other.svmbir_volume(as_thickness(disc_lines()), views, Grid.of_views(views), None, quiet)

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from helpers.bench_names import APART, BOTH_SIDES, MOST_VOXELS, NAMES, THIN
-from holosplat.beamline.declared.declaration import declared_names
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
 from holosplat.materials import DeltaBeta, parse_material
@@ -22,6 +21,7 @@ from holosplat.specimens.rods import RodScene
 from holosplat.specimens.scene import MeshScene
 from holosplat.tables import merged
 from holosplat_bench.suite.case import FOLDER, Case, case_names, load_case
+from holosplat_bench.suite.declared import declared_names
 
 SLOW = ("crowded12",)
 """Scenes that take seconds to make: that they follow their seed is tested on smaller ones (test_specimens_phantoms)."""

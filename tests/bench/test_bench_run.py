@@ -10,21 +10,22 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from holosplat.beamline.declaration import Case
 from scipy.ndimage import gaussian_filter
 
 import holosplat as hs
 from helpers.bench_shop import MATERIAL, PITCH, Recorder, fail, make_case, suite, voxels
-from holosplat.beamline.declared.declaration import Case
 from holosplat.matter import Matter
 from holosplat.optics.sampling import fringe_sampling
-from holosplat.representations.voxels import VoxelGrid
+from holosplat.representations import NeuralField, SurfaceMesh, VoxelGrid
+from holosplat.representations.neural_field import Network
 from holosplat.specimens.phantoms import star_of_balls
 from holosplat.workflows.evaluate import score_object
 from holosplat_bench.suite import methods, run
 from holosplat_bench.suite.folder import BenchFolder, Row, read_row, write_row
 from holosplat_bench.suite.methods import REFERENCES
 from holosplat_bench.suite.prepare import fingerprint, prepared
-from holosplat_bench.suite.run import Suite, contrast_by_size, run_suite
+from holosplat_bench.suite.run import Suite, contrast_by_size, run_suite, stored_bytes
 
 pytestmark = pytest.mark.usefixtures("unjudged_runs")
 
@@ -48,6 +49,16 @@ def test_every_method_gets_a_row_for_every_case_and_seed(recorder, tmp_path):
     assert all(row.done and row.seconds > 0 and row.when and row.machine["threads"] for row in rows)
     assert {row.family for row in rows} == {"fakes"}
     assert len({row.scan_hash for row in rows}) == 4
+
+
+def test_results_are_as_large_as_files_of_them_have_to_be():
+    grid, matter = hs.Grid.centred((3, 4, 5), 1e-6), Matter.one(1e-6, 1e-9)
+    values, mask = torch.rand(1, *grid.shape), torch.ones(grid.shape, dtype=torch.bool)
+    field = NeuralField(grid, matter, Network(hidden=8), mask, 0)
+    mesh = SurfaceMesh(torch.rand(7, 3), torch.tensor([[0, 1, 2], [2, 1, 6]]), 1e-6, matter)
+    assert stored_bytes(VoxelGrid(values, grid, matter)) == 2 * 60
+    assert stored_bytes(field) == 2 * sum(weight.numel() for weight in field.parameters().values()) + 60 // 8
+    assert stored_bytes(mesh) == 4 * 3 * (7 + 2)
 
 
 def test_a_method_sees_the_training_frames_and_the_prior_only(recorder, tmp_path):
@@ -81,21 +92,19 @@ def test_a_row_holds_the_scores(recorder, tmp_path):
     assert picture["frc"] == pytest.approx(scores.test.frc.mean(axis=0))
 
 
-def test_the_size_of_a_result_is_what_it_says_or_unknown(recorder, tmp_path):
-    class Sized(VoxelGrid):
-        stored_bytes = 1234  # type: ignore[assignment]
-
-    def sized(scan):
-        v = voxels(scan)
-        return Sized(v.values, v.grid, v.matter)
-
+def test_the_size_of_a_result_is_known_if_it_can_be_stored(recorder, tmp_path):
     class Plain:
         def __init__(self, obj: hs.volume.Object) -> None:
             self.at, self.project, self.voxelise = obj.at, obj.project, obj.voxelise
 
-    folder = BenchFolder(tmp_path / "bench")
-    run_suite(suite([recorder.method("sized", sized), recorder.method("plain", lambda s: Plain(voxels(s)))]), folder)
-    assert [row.stored_bytes for row in folder.read_rows()] == [1234, None]
+    folder, seen = BenchFolder(tmp_path / "bench"), list[VoxelGrid]()
+
+    def stored(scan):
+        seen.append(voxels(scan))
+        return seen[-1]
+
+    run_suite(suite([recorder.method("stored", stored), recorder.method("plain", lambda s: Plain(voxels(s)))]), folder)
+    assert [row.stored_bytes for row in folder.read_rows()] == [2 * seen[0].values.numel(), None]
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux says what a process holds")

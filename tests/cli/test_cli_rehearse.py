@@ -13,7 +13,7 @@ from helpers.cli import holosplat, refused, worked
 from holosplat.cli import view
 from holosplat.io.atomic import read_json, write_json
 from holosplat.show.parts import LEVEL, likely_surfaces
-from holosplat.workflows import next_step, rehearsal
+from holosplat.workflows import certainty, rehearsal
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def run(tmp_path_factory):
 
 
 def test_intervals_are_printed_and_kept(run, monkeypatch):
-    monkeypatch.setattr(next_step, "MISTAKES", {})
+    monkeypatch.setattr(certainty, "MISTAKES", {})
     said = worked(holosplat("rehearse", run, "--times", 2))
     assert "verdict by 2 rehearsals" in said.out
     assert ", by 2 rehearsals and" in said.out
@@ -50,7 +50,7 @@ def test_intervals_are_printed_and_kept(run, monkeypatch):
 
 
 def test_the_map_of_matter_is_exported_and_viewed(run, tmp_path, monkeypatch):
-    monkeypatch.setattr(next_step, "MISTAKES", {})
+    monkeypatch.setattr(certainty, "MISTAKES", {})
     worked(holosplat("rehearse", run, "--times", 2))
     likely = rehearsal.matter_of(hs.RunFolder(run))
     assert likely is not None

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from holosplat.geometry import Views
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.matter import Matter
-from holosplat.mesh import TriangleMesh
+from holosplat.mesh import TriangleMesh, joined
 from holosplat.representations import SurfaceMesh
 from holosplat.specimens.red_cells import icosphere
 
@@ -30,13 +30,6 @@ def poses(count: int, shape=SHAPE, seed: int = 0, pitch: float = 1.0) -> Views:
     return Views(Rotation.random(count, rng=seed).as_matrix(), shifts, shape, pitch)
 
 
-def area(mesh: TriangleMesh) -> float:
-    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
-    return float(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
-
-
 def surfaces(*meshes: TriangleMesh, unit: float = 1e-6) -> SurfaceMesh:
-    starts = np.cumsum([0, *(len(m.vertices) for m in meshes)])
-    vertices = np.concatenate([m.vertices for m in meshes])
-    faces = np.concatenate([m.faces + s for m, s in zip(meshes, starts)])
-    return SurfaceMesh(torch.from_numpy(vertices), torch.from_numpy(faces), unit, Matter.one(DELTA, BETA))
+    whole = joined(meshes)
+    return SurfaceMesh(torch.from_numpy(whole.vertices), torch.from_numpy(whole.faces), unit, Matter.one(DELTA, BETA))

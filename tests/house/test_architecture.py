@@ -47,7 +47,6 @@ SAME_TIER = dict.fromkeys(TIERS[0], TIERS[0])
 
 BACKENDS = ("*/cpu.py", "*/cuda.py", "*/reference.py")
 BACKEND_IMPORTS = {
-    "projectors/mesh/reference.py": ("geometry",),
     "optics/hologram/reference.py": ("optics",),
     "baselines/tv_steps/cuda.py": ("projectors",),
 }
@@ -320,7 +319,7 @@ GOOD: Files = {
     "projectors/__init__.py": '"""Lines."""\n',
     "native.py": '"""Kernels."""\n',
     "projectors/mesh/__init__.py": '"""Meshes."""\nfrom . import reference\nfrom ...geometry import Views\n',
-    "projectors/mesh/reference.py": '"""Twin."""\nfrom ... import native\nfrom ...geometry import Views\n',
+    "projectors/mesh/reference.py": '"""Twin."""\nfrom ... import native\n',
     "io/__init__.py": '"""Files."""\nfrom ..version import __version__\nfrom ..optics import y\n',
     "report/__init__.py": '"""Pages."""\nimport matplotlib.pyplot\n',
     "cli.py": '"""Commands."""\nimport tyro\nfrom . import report\nfrom holosplat.optics.wave import y\n',

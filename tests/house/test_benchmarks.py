@@ -11,12 +11,15 @@ import numpy as np
 import pytest
 import torch
 
+from holosplat.checks import InputError
 from holosplat.fit.problem import Schedule
 from holosplat.fit.terms import Objective
 from holosplat.methods import FitOptions, GaussianRates
 from holosplat.methods.presets import preset
 from holosplat.model import measure
 from holosplat.projectors.splat import splat
+from holosplat.specimens.membrane.model import Membrane
+from holosplat.specimens.membrane.rest import resting_cell
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 
@@ -149,6 +152,34 @@ def test_the_table_of_the_tweezers(scripts):
     assert len(lines) == 12
     assert "| 68 | **11.80** | 12.87 (11.88–13.87) | 4.64 |" in lines[5]
     assert "| **5.30** |" in lines[6]
+
+
+def test_a_cell_in_optical_tweezers(scripts):
+    """Two of the ten forces of Dao (2003) and Mills (2004), with their bounds, on a coarse mesh."""
+    found = scripts["tweezers"].stretch(Membrane(resting_cell(3)), [47e-12, 109e-12])
+    for s, (axial, transverse) in zip(found, (((10.82, 12.97), (4.29, 5.83)), ((12.87, 15.82), (3.98, 5.23)))):
+        assert axial[0] <= 1e6 * s.axial <= axial[1]
+        assert transverse[0] <= 1e6 * s.transverse <= transverse[1]
+        assert abs(s.area) < 0.01
+        assert abs(s.volume) < 0.01
+        assert s.residual < 1e-14
+    with pytest.raises(InputError, match="forces must rise"):
+        scripts["tweezers"].stretch(Membrane(resting_cell(3)), [2e-11, 1e-11])
+
+
+def test_measures_of_the_shapes_of_cells(scripts):
+    flow = scripts["espresso_flow"]
+    nodes = resting_cell(4).vertices
+    turn, _ = np.linalg.qr(np.random.default_rng(5).standard_normal((3, 3)))
+    turn *= np.sign(np.linalg.det(turn))
+    moved = np.stack([nodes @ turn.T + 3e-6, nodes * [1.5, 1, 1]])
+    assert flow.shape_change(moved, nodes)[0] < 1e-12
+    assert flow.elongation(nodes) == pytest.approx(0, abs=2e-3)
+    assert flow.elongation(moved)[1] == pytest.approx(0.2, abs=2e-3)  # (1.5 - 1)/(1.5 + 1)
+    pulled = flow.shape_change(moved, nodes)[1]
+    assert pulled == pytest.approx(np.sqrt(((0.5 * nodes[:, 0]) ** 2).mean()), rel=1e-6)  # no turn fits better
+    _, axes = flow.gyration_axes(moved)
+    assert abs(axes[1, 0, 2]) == pytest.approx(1, abs=1e-6)
 
 
 def test_espressos_cells_go_on_as_espresso_has_them(scripts, espresso_rbc):

@@ -16,14 +16,14 @@ from typing import Any
 import pytest
 
 import holosplat
-from holosplat.beamline.declared import declaration, specimens
+import holosplat_bench.suite
 from holosplat.checks import InputError
 from holosplat.cli.entry import COMMANDS, command
 from holosplat.materials import DeltaBeta
 from holosplat.ranges import _fields, hints_of, range_of, with_checked_numbers
 from holosplat.specimens.matter import CHANGING, MATTER
 
-ROOT = Path(holosplat.__file__).parent
+ROOTS = [Path(package.__file__ or "").parent for package in (holosplat, holosplat_bench.suite)]
 INTERNAL = {"Group", "Choice", "_Best", "_Unread", "Mark", "Block", "Blocks", "Decision", "Fields"}
 """What the code makes itself, of values that are checked."""
 NEEDED: dict[str, dict[str, Any]] = {
@@ -58,8 +58,6 @@ NEEDED: dict[str, dict[str, Any]] = {
 }
 NEEDED |= {kind.__name__: {"size": 4e-5} for kind in (*MATTER.values(), *CHANGING.values())}
 """What options without a default are made of here."""
-OF_DECLARATIONS = (declaration, specimens, specimens)
-
 
 MARKS = r"^((?:@.*\n)*@(?:checked_)?dataclass.*\n(?:@.*\n)*)"
 CLASS = re.compile(MARKS + r"class (\w+).*\n((?:(?:    .*)?\n)*)", re.MULTILINE)
@@ -72,8 +70,8 @@ PLAIN = re.compile(r"(?<!\w)(?:float|int)(?!\w)")
 def classes() -> dict[str, tuple[str, bool, bool]]:
     """Of each dataclass with numbers: its module, whether all its fields have defaults, and whether it is ranged."""
     found = {}
-    for path in ROOT.rglob("*.py"):
-        module = "holosplat." + ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+    for path in (path for root in ROOTS for path in root.rglob("*.py")):
+        module = ".".join(path.relative_to(ROOTS[0].parent).with_suffix("").parts).removesuffix(".__init__")
         for marks, name, body in CLASS.findall(path.read_text(encoding="utf-8")):
             fields = [field for field in FIELD.findall(body) if "ClassVar" not in field[0]]
             is_ranged = RANGED.search(marks) is not None
@@ -83,7 +81,11 @@ def classes() -> dict[str, tuple[str, bool, bool]]:
 
 
 def all_ranged() -> list[str]:
-    return [name for name, (_, _, is_ranged) in classes().items() if is_ranged and not name.endswith(".Declaration")]
+    return [
+        name
+        for name, (_, _, is_ranged) in classes().items()
+        if is_ranged and not name.endswith((".Declaration", ".FileOfCase"))
+    ]
 
 
 def made(name: str) -> Any:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.bumpy import DELTA, area, bumpy, poses, surfaces
+from helpers.bumpy import DELTA, bumpy, poses, surfaces
 from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
 from holosplat.fit.loop import Fit
@@ -80,7 +80,7 @@ def test_smoothness_smooths_and_no_step_changes_nothing(few_views):
     noise = 0.3 * torch.randn(start.vertices.shape, generator=torch.Generator().manual_seed(1))
     rough = start.with_parameters({"vertices": start.vertices + noise})
     assert torch.equal(fitted(scan, rough, steps=0).vertices, rough.vertices)
-    areas = [area(fitted(scan, rough, steps=8, bending=w).mesh()) for w in (0.0, 100.0)]
+    areas = [fitted(scan, rough, steps=8, bending=w).mesh().area for w in (0.0, 100.0)]
     assert areas[1] < 0.97 * areas[0]
 
 

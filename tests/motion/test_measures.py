@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from helpers.polycube import polycube
 from holosplat.bodies.rest_shape import centroid, is_cut, moments
 from holosplat.geometry import Views
 from holosplat.matter import Matter
@@ -33,6 +34,9 @@ def test_moments_are_those_of_an_ellipsoid():
     assert volume == pytest.approx(4 / 3 * np.pi * AXES.prod(), rel=4e-3)
     assert centre == pytest.approx(CENTRE, abs=1e-12)
     assert centroid(ellipsoid()) == pytest.approx(CENTRE, abs=1e-12)
+    bent = polycube(2.0, ((0, 0, 0), (1, 0, 0), (0, 1, 0)))
+    assert centroid(bent) == pytest.approx([5 / 3, 5 / 3, 1], abs=1e-12)
+    assert bent.volume == pytest.approx(24)
     assert TURN.T @ second @ TURN / volume == pytest.approx(np.diag(AXES**2) / 5, rel=4e-3, abs=1e-17)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from holosplat.checks import InputError
+from holosplat.frames import block_means
 from holosplat.preprocess import (
     EigenFlats,
     PixelRepair,
@@ -18,7 +19,7 @@ from holosplat.preprocess import (
     significant,
     unlit,
 )
-from holosplat.preprocess.eigen_flats import _binned, _effective
+from holosplat.preprocess.eigen_flats import _effective
 from holosplat.preprocess.pixels import mean_frame
 
 H, W = 53, 70
@@ -204,14 +205,14 @@ def test_strong_objects_fool_least_squares_more_than_total_variation():
     shadow = np.ones((H, W))
     shadow[10:30, 15:45] = 0.6
     frame = truth.light(weights) * shadow
-    by_squares = find._projected(_binned(frame, 1)) * deviations
+    by_squares = find._projected(block_means(frame, 1)) * deviations
     assert np.abs(find(frame) - weights).max() < 0.2 * np.abs(by_squares - weights).max()
 
 
 def test_the_gradient_of_the_variation_is_its_derivative():
     drawn, _ = flats(np.array([6.0, 4.0, 2.0]), 30, 1.0)
     find = TotalVariationWeights(components(drawn), 2)
-    frame = _binned(drawn[0] * fringes(1, 0.3), 2)
+    frame = block_means(drawn[0] * fringes(1, 0.3), 2)
     at = np.array([0.3, -0.7, 1.1])
     _, gradient = find._variation(frame, at, 0.01)
     numeric = [

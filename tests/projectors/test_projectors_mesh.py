@@ -16,6 +16,7 @@ from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
 from holosplat.mesh import TriangleMesh
 from holosplat.projectors.mesh import mesh_line_integrals, voxelise_meshes
+from holosplat.projectors.mesh import rays as mesh_rays
 from holosplat.projectors.voxels import SliceProjector, voxel_line_integrals
 
 SHAPE = (33, 46)
@@ -289,6 +290,25 @@ def test_values_of_voxels():
     assert shell.sum() * cell == pytest.approx(2 * (12**3 - 4**3), rel=5e-3)
     assert solid.sum() * cell == pytest.approx(12**3, rel=5e-3)
     assert shell[9, 7, 14] == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize("rays", [1, 3])
+def test_batches_change_nothing(monkeypatch, rays):
+    """Overlapping bodies, one of them cut by the field, in views about no axis in particular."""
+    vertices, faces = joined(icosphere(2, 6.0), *(
+        icosphere(2, radius).transformed(np.eye(3), np.array(at))
+        for radius, at in ((3.5, (4.0, -3.0, 2.0)), (4.0, (21.0, 2.0, -5.0)))
+    ))  # fmt: skip
+    values = np.random.default_rng(0).normal(size=(2, len(faces)))
+    whole = mesh_line_integrals(vertices, faces, values, poses(3), rays)
+    monkeypatch.setattr(mesh_rays, "MAX_HITS", {"cpu": 100})
+    parts = mesh_line_integrals(vertices, faces, values, poses(3), rays)
+    assert torch.allclose(parts, whole, rtol=0, atol=1e-12 * float(whole.abs().max()))
+
+
+def test_an_empty_field_is_no_trouble():
+    body = box((-3.0, -3, -3), (3.0, 3, 3)).transformed(np.eye(3), np.array([1e3, 0, 0]))
+    assert not image(body, poses(1)).any()
 
 
 # --- between projectors -------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from helpers.bumpy import BETA, DELTA, SHAPE, area, bumpy, poses, surfaces
+from helpers.bumpy import BETA, DELTA, SHAPE, bumpy, poses, surfaces
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Poses, Views
 from holosplat.materials import HAEMOGLOBIN
@@ -234,7 +234,7 @@ def test_volume_and_area_of_spheres_converge_to_second_order():
         shape = (round(17 / pitch), round(19 / pitch), round(16 / pitch))
         grid = Grid.centred(shape, pitch)
         mesh = isosurface(ball(r, grid), grid, smoothing=0)
-        gaps.append((abs(mesh.volume / (4 / 3 * np.pi * r**3) - 1), abs(area(mesh) / (4 * np.pi * r**2) - 1)))
+        gaps.append((abs(mesh.volume / (4 / 3 * np.pi * r**3) - 1), abs(mesh.area / (4 * np.pi * r**2) - 1)))
     for volume, surface in ((0, 1), (1, 2)):
         assert gaps[volume][0] / gaps[surface][0] > 3.2
         assert gaps[volume][1] / gaps[surface][1] > 3.2
@@ -248,7 +248,7 @@ def test_surfaces_are_closed_and_smoothing_keeps_their_volume():
     rough, smooth = (isosurface(hard, grid, least_volume=1.0, smoothing=n) for n in (0, 10))
     assert np.array_equal(closed(smooth).faces.shape, smooth.faces.shape)
     assert abs(smooth.volume / rough.volume - 1) < 0.03
-    assert area(smooth) < 0.97 * area(rough)
+    assert smooth.area < 0.97 * rough.area
 
 
 def test_specks_are_left_out_and_an_empty_volume_is_refused():

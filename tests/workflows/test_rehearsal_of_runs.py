@@ -19,18 +19,21 @@ from holosplat.optics import NoiseModel
 from holosplat.optics.background import LightOptions
 from holosplat.representations import VoxelGrid
 from holosplat.volume import Volume
-from holosplat.workflows import Reconstruction, RunFolder, certainty, next_step, rehearsal
+from holosplat.workflows import Reconstruction, RunFolder, certainty, rehearsal
 from holosplat.workflows.certainty import (
     BINS,
+    MISTAKES,
+    NULL,
     Factor,
     MatterMap,
     centre_and_scale,
+    compare_causes,
     conformal_quantile,
     errors_of,
     matter_probabilities,
     occupancy_counts,
 )
-from holosplat.workflows.next_step import MISTAKES, NULL, STEPS, compare_causes
+from holosplat.workflows.next_step import STEPS
 from holosplat.workflows.rehearsal import Again, Rehearsal, read_rehearsal, rehearse
 from holosplat.workflows.verdict import Verdict
 
@@ -305,7 +308,7 @@ def test_every_mistake_has_a_command():
 def test_mistakes_are_found_on_held_out_frames_and_none_where_there_is_none(monkeypatch):
     scan, method = scan_of(12), METHODS["paganin-tv"]
     few = ("other sign of δ", "twice the angles", "matter beyond the field")
-    monkeypatch.setattr(next_step, "MISTAKES", {name: MISTAKES[name] for name in few})
+    monkeypatch.setattr(certainty, "MISTAKES", {name: MISTAKES[name] for name in few})
     again = Again(PRIOR, method, 0, hs.reconstruct(scan, PRIOR, method))
     halved, _ = MISTAKES["half the angles"][1](scan, again)
     found = compare_causes(halved, again)
@@ -325,7 +328,7 @@ def test_the_verdict_separates_right_and_wrong_scans(wrong, few, monkeypatch):
     scan, method = scan_of(12, 50000.0), METHODS["holographic-tv"]
     if wrong:
         scan, _ = MISTAKES[wrong][1](scan, Again(PRIOR, method, 0, few[0]))
-    monkeypatch.setattr(next_step, "MISTAKES", {name: MISTAKES[name] for name in tried})
+    monkeypatch.setattr(certainty, "MISTAKES", {name: MISTAKES[name] for name in tried})
     shown = rehearse(hs.reconstruct(scan, PRIOR, method), scan, PRIOR, method, times=2)
     assert (shown.word == "wrong") == bool(wrong)
     if wrong:

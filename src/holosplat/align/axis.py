@@ -9,11 +9,13 @@ from itertools import pairwise
 import numpy as np
 
 from ..checks import InputError, at_least, in_range, require
-from ..geometry import Views, rotation_y
+from ..frames import evenly
+from ..geometry import rotation_y
 from ..inference import Compared, Decision
 from ..optics.background import LightOptions
 from ..progress import Advance
 from ..ranges import checked_dataclass
+from ..rotations import angles_about_y
 from ..scan import Exposures, Scan
 from .consistency import (
     Consistency,
@@ -98,7 +100,7 @@ class Axis:
         views, p = exposures.views, exposures.views.pixel_size
         rotations = views.rotations
         if self.turn is not None:
-            angles = np.unwrap(_angles(views))
+            angles = np.unwrap(angles_about_y(views.rotations))
             rotations = rotations @ rotation_y(np.rad2deg(self.turn.spread(angles) - angles))
         if self.leans and self.lean is not None:
             angle = -np.arctan(self.lean.value)
@@ -154,7 +156,7 @@ def find_axis(
     if pairs is not None:
         found = _against(pairs, found, scan)
     assert found is not None
-    angles = np.unwrap(_angles(scan.views))
+    angles = np.unwrap(angles_about_y(scan.views.rotations))
     if not may_be_half(angles):
         return found
     ends = _sinograms(scan[ends_of(len(scan))], options, ratio, light)
@@ -216,7 +218,7 @@ def sinograms_of(scan: Scan, options: AxisOptions, ratio: float | None, light: L
         "the axis is that of views which turn about the object's y axis alone, but these do not; align without "
         "--axis-only.",
     )
-    chosen = np.unique(np.linspace(0, len(scan) - 1, min(len(scan), options.views)).round().astype(int))
+    chosen = evenly(len(scan), options.views)
     require(
         len(chosen) >= FEWEST_VIEWS,
         f"an axis needs {FEWEST_VIEWS} views at least, but there are {len(chosen)}; align without --axis-only.",
@@ -239,7 +241,9 @@ def _sinograms(scan: Scan, options: AxisOptions, ratio: float | None, light: Lig
     values, heights = values[:, seen], heights[seen]
     sideways = views.shifts[:, :1] / p
     positions = np.arange(w) + 0.5 - w / 2 + (sideways[:1] if np.ptp(sideways) < 1e-9 else sideways)
-    return Sinograms(values, _angles(views), positions, heights).binned(max(1, -(-w // options.columns)))
+    return Sinograms(values, angles_about_y(views.rotations), positions, heights).binned(
+        max(1, -(-w // options.columns))
+    )
 
 
 def _mean_row(images: np.ndarray) -> np.ndarray:
@@ -252,10 +256,6 @@ def _mean_row(images: np.ndarray) -> np.ndarray:
         if there.any():
             row[~there] = np.interp(np.flatnonzero(~there), np.flatnonzero(there), row[there])
     return rows
-
-
-def _angles(views: Views) -> np.ndarray:
-    return np.arctan2(views.rotations[:, 0, 2], views.rotations[:, 0, 0])
 
 
 FEWEST_SLICES = 4

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from ..checks import require
+from ..frames import evenly
 from ..inference import Decision, Score
 from ..matter import DeltaBeta, Known, MaterialPrior
 from ..methods.ground import assumed_material
@@ -288,7 +289,7 @@ def _by_volumes(
 def _residuals(search: SeriesSearch, planned: Exposures, found: Found) -> tuple[np.ndarray, Score]:
     """[B] rms of what volumes of some times leave of the frames of each beam, as a share of their contrast; and what
     they leave of the training frames."""
-    some = np.unique(np.linspace(0, len(search.moments) - 1, min(JUDGED, len(search.moments))).round().astype(int))
+    some = evenly(len(search.moments), JUDGED)
     sums, counts, scores = np.zeros(len(planned)), np.zeros(len(planned)), list[Score]()
     for k in some:
         moment = search.moments[k]

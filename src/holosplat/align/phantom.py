@@ -13,10 +13,11 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from ..baselines import TOMOGRAPHIES
+from ..bodies.rest_shape import centroid
 from ..checks import positive, require
 from ..geometry import Grid, Views
 from ..matter import DeltaBeta, Matter
-from ..mesh import TriangleMesh
+from ..mesh import TriangleMesh, joined
 from ..model import Alignment, Instrument
 from ..optics.noise import left_of
 from ..projectors.surface import surface_occupancy
@@ -47,7 +48,9 @@ class Phantom:
     @classmethod
     def of_mesh(cls, mesh: TriangleMesh) -> Phantom:
         """A rigid body; where its file puts it does not matter."""
-        centre = centre_of_mass(mesh)
+        sound = mesh.volume > 0
+        require(sound, f"{mesh.name} must be a closed mesh wound outwards, but it encloses no volume; repair it.")
+        centre = centroid(mesh)
         return cls((mesh.transformed(np.eye(3), -centre),), np.zeros((1, 3)), np.eye(3), False)
 
     @classmethod
@@ -81,22 +84,9 @@ class Phantom:
 
     def surfaces(self, material: DeltaBeta, pixel: float, only: Sequence[int] | None = None) -> SurfaceMesh:
         """All bodies, or `only` some, filled with `material`, in units of `pixel` [m]."""
-        meshes = [self.mesh(n) for n in (range(len(self)) if only is None else only)]
-        starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
-        faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts)])
-        vertices = np.concatenate([mesh.vertices for mesh in meshes]) / pixel
+        whole = joined([self.mesh(n) for n in (range(len(self)) if only is None else only)])
         matter = Matter.one(material.delta, material.beta)
-        return SurfaceMesh(torch.from_numpy(vertices), torch.from_numpy(faces), pixel, matter)
-
-
-def centre_of_mass(mesh: TriangleMesh) -> np.ndarray:
-    """That [3] of the inside of a closed mesh [m]: of tetrahedra from one point (divergence theorem)."""
-    origin = mesh.vertices.mean(0)
-    a, b, c = np.moveaxis((mesh.vertices - origin)[mesh.faces], 1, 0)
-    volumes = np.einsum("fi,fi->f", a, np.cross(b, c))
-    total = float(volumes.sum())
-    require(total > 0, f"{mesh.name} must be a closed mesh wound outwards, but it encloses no volume; repair it.")
-    return origin + volumes @ (a + b + c) / (4 * total)
+        return SurfaceMesh(torch.from_numpy(whole.vertices / pixel), torch.from_numpy(whole.faces), pixel, matter)
 
 
 TRIALS = 600

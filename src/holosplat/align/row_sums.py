@@ -15,6 +15,7 @@ from scipy.ndimage import gaussian_filter1d, map_coordinates
 
 from ..geometry import Views
 from ..inference import Score
+from ..rotations import angles_about_y
 
 COUNT = 6
 """Numbers of each view: shifts x, y [pixels], turns about x, y, z of the lab [rad], as `derivatives.NUMBERS` begins;
@@ -44,7 +45,7 @@ def plane_angles(views: Views) -> np.ndarray | None:
         return None
     if np.abs(views.rotations[:, 1] - np.array([0.0, 1.0, 0.0])).max() > FLAT:
         return None
-    return np.arctan2(views.rotations[:, 0, 2], views.rotations[:, 0, 0])
+    return angles_about_y(views.rotations)
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from ..memory import memory_kept
 from ..progress import Advance
 from ..projectors.voxels import Projector, SliceProjector, projector_for
 from ..ranges import checked_dataclass
+from ..rotations import angles_about_y
 from .rays import Rays, bounded, checked_upper, in_pixels, rays_of
 
 
@@ -78,7 +79,7 @@ def _explained(lines: Tensor, views: Views, grid: Grid, missing: Tensor) -> Tens
 
 def angular_weights(views: Views) -> Tensor:
     """[V] in radians: half the gaps to the neighbours' angles on both sides, modulo 180°; their sum is π."""
-    angles = np.arctan2(views.rotations[:, 0, 2], views.rotations[:, 0, 0]) % np.pi
+    angles = angles_about_y(views.rotations) % np.pi
     order = np.argsort(angles, kind="stable")
     gaps = np.diff(angles[order], append=angles[order[0]] + np.pi)
     weights = np.empty(len(angles))

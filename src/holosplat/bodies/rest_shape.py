@@ -67,7 +67,7 @@ class KnownBody:
                 f"a body of known shape must have a radius of {LEAST_PX:g} to {MOST_PX:g} pixels, but this one has "
                 f"{radius:.3g}; check the size or length_unit of the body, and the pixel size."
             )
-        wanted = COARSE if coarse else int(np.clip(surface(found) * (factor / pixel) ** 2, FEWEST, MOST))
+        wanted = COARSE if coarse else int(np.clip(found.area * (factor / pixel) ** 2, FEWEST, MOST))
         if self.shape == RED_CELL:
             found = resting_cell(int(np.clip(round((wanted / 20) ** 0.5), *FREQUENCIES)))
         else:
@@ -95,12 +95,6 @@ def extent_like(meshes: Sequence[TriangleMesh]) -> float:
 def guessed_cells(extent: float) -> KnownBody:
     """Red cells of about that largest extent [m], as guesses of them have it."""
     return KnownBody(size=extent, uncertain=GUESSED)
-
-
-def surface(mesh: TriangleMesh) -> float:
-    """Its area, in the squared unit of its vertices."""
-    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
-    return 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
 
 
 def thinned(mesh: TriangleMesh, triangles: int) -> TriangleMesh:

@@ -11,6 +11,7 @@ import numpy as np
 from tyro.conf import arg
 
 from ..checks import in_range, require
+from ..frames import evenly
 from ..planning.contrast import Setup
 from ..planning.plan import Motion, Plan, Recording, Sampling, Storage, Survey, Waves, experiment
 from ..planning.plan import plan as make_plan
@@ -352,7 +353,7 @@ def _survey_lines(survey: Survey) -> list[str]:
     """The best distance of several energies, and where the best of all lies."""
     energy, distance = survey.best
     rows, count = survey.table(), len(survey.energies_kev)
-    shown = sorted({*np.linspace(0, count - 1, min(count, MOST_ROWS)).round().astype(int).tolist(), energy})
+    shown = sorted({*evenly(count, MOST_ROWS).tolist(), energy})
     photons = _number(survey.photons_per_pixel)
     lines = [
         f"best distance; signal to noise (SNR) with {photons} photons/px, rms over the places on the pixels;",

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ..checks import finite, require
+from ..frames import evenly, rfft_weights
 from ..memory import memory_kept
 from ..model import Alignment, Instrument, LightField, Model, smooth_modes
 from ..ranges import Weight, checked_dataclass
@@ -59,11 +60,7 @@ class Rings:
         band = torch.bucketize(radius, torch.from_numpy(edges[1:-1] * (1 + 1e-9)))
         held = torch.bincount(band.flatten(), minlength=len(edges) - 1) > 0  # frames of few rows leave bands empty
         edges, band = np.append(edges[:-1][held.numpy()], edges[-1]), (held.cumsum(0) - 1)[band]
-        weight = torch.full_like(radius, 2.0)
-        weight[:, 0] = 1
-        if w % 2 == 0:
-            weight[:, -1] = 1
-        return cls(band, weight, edges)
+        return cls(band, torch.from_numpy(rfft_weights(w)).expand(h, -1), edges)
 
     def __len__(self) -> int:
         return len(self.edges) - 1
@@ -199,7 +196,7 @@ def residuals(
         f"measured frames must have the shape {wanted} of the exposures, but they have {tuple(measured.shape)}.",
     )
     rings = Rings.of(views.shape, views.finest)
-    probed = np.unique(np.linspace(0, count - 1, min(count, MOST_PROBED)).round().astype(int))
+    probed = evenly(count, MOST_PROBED)
     spectra, sampling, changes = list[Tensor](), list[Tensor](), list[Tensor]()
     for i in range(count):
         one = said.view(i)

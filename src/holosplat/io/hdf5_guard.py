@@ -6,6 +6,7 @@ A link, a virtual dataset or external storage can make a reader copy any file of
 from __future__ import annotations
 
 import errno
+import math
 import os
 import re
 import time
@@ -114,9 +115,7 @@ def _dataset_files(dataset: h5d.DatasetID, path: Path, name: bytes, allowed: boo
     unknown_filters(plan)  # loads those that are installed; others are named where values are read
     if dataset.shape is None:  # a null dataspace holds nothing, which whoever wants a value says
         return []
-    declared = dataset.get_type().get_size()
-    for length in dataset.shape:
-        declared *= length
+    declared = math.prod(dataset.shape, start=dataset.get_type().get_size())
     virtual, external = plan.get_layout() == h5d.VIRTUAL, plan.get_external_count() > 0
     others = virtual and any(plan.get_virtual_filename(n) != "." for n in range(plan.get_virtual_count()))
     require(allowed or not (others or external), _refers(path, name, "has its values in another file"))
@@ -171,9 +170,7 @@ def require_chunks(dataset: h5d.DatasetID, label: str, size: int) -> None:
     plan = dataset.get_create_plist()
     if plan.get_layout() != h5d.CHUNKED:
         return
-    declared = dataset.get_type().get_size()
-    for length in plan.get_chunk():
-        declared *= length
+    declared = math.prod(plan.get_chunk(), start=dataset.get_type().get_size())
     require_declared(f"a chunk of {label}", declared, size)
     filters = [plan.get_filter(number)[0] for number in range(plan.get_nfilters())]
     if h5z.FILTER_DEFLATE not in filters:

@@ -15,13 +15,13 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from ..checks import LONGEST, InputError, finite, require
+from ..checks import InputError, finite, require
 from ..geometry import Grid
 from ..progress import Advance
 from ..units import LENGTH_UNITS, unit_factor
 from ..volume import Object, Volume
 from .atomic import atomic_folder, atomic_path, require_new
-from .guard import require_memory
+from .guard import require_memory, undamaged
 from .hdf5 import require_room
 from .stacks import all_images, image_numbers, open_tiff
 from .volumes import ABSORPTION, NAMES, REFRACTION, SLAB_VOXELS, Contents, Stored, contents_of, grid_of, slabs_of
@@ -149,7 +149,7 @@ def read_ome_zarr(path: Path) -> Stored:
     """
     zarr = require_zarr()
     require(path.is_dir(), f"{path} must be a folder of OME-Zarr, but there is none; check the path.")
-    try:
+    with undamaged(path, "an OME-Zarr of δ and β, as `holosplat export` writes it"):
         group = zarr.open_group(store=str(path), mode="r", zarr_format=2)
         image = group.attrs["multiscales"][0]
         channels = tuple(channel["label"] for channel in group.attrs["omero"]["channels"])
@@ -163,14 +163,6 @@ def read_ome_zarr(path: Path) -> Stored:
         require_memory(str(path), 4 * math.prod(array.shape))
         size, origin = ((values[1:] * factors)[::-1] for values in (scale, place))
         first, beta = np.asarray(array[:], dtype=np.float32)
-    except (InputError, MemoryError):
-        raise
-    except Exception as error:  # zarr and its codecs raise many kinds for damaged folders
-        said = " ".join(str(error).split())[:LONGEST] or type(error).__name__
-        raise InputError(
-            f"{path} must be an OME-Zarr of δ and β, as `holosplat export` writes it, but it is damaged or another "
-            f"one: {said}."
-        ) from None
     grid = grid_of(path, first.shape, size.tolist(), origin.tolist())
     return Stored((finite(f"{path}", first), finite(f"{path}", beta)), grid, of)
 

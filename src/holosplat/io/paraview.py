@@ -31,7 +31,7 @@ import numpy as np
 from ..checks import InputError, positive, require, require_regular
 from ..geometry import Grid
 from ..matter import Matter
-from ..mesh import TriangleMesh
+from ..mesh import TriangleMesh, joined
 from ..progress import Advance
 from ..tables import number_in
 from ..units import LENGTH_UNITS, TIME_UNITS, unit_factor
@@ -158,9 +158,8 @@ def write_vtu(path: Path, bodies: Sequence[TriangleMesh], matter: Matter, of: Co
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
     require(len(bodies) > 0, f"{path} needs at least one body.")
-    before = np.cumsum([0, *(len(body.vertices) for body in bodies)])
-    places = np.concatenate([body.vertices for body in bodies]) / LENGTH_UNITS[LENGTH_UNIT]
-    corners = np.concatenate([body.faces + start for body, start in zip(bodies, before)])
+    whole = joined(bodies)
+    places, corners = whole.vertices / LENGTH_UNITS[LENGTH_UNIT], whole.faces
     number = np.repeat(np.arange(len(bodies), dtype=np.int32), [len(body.faces) for body in bodies])
     data = {name: np.full(len(corners), value) for name, value in of.of_matter(matter).items()}
     data = {BODY: number, **data, "volume_m3": np.array([body.volume for body in bodies])[number]}

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import InputError, MissingError, note, require, require_regular
+from ..checks import MissingError, note, require, require_regular
 from .guard import RATIO, SMALL, mapped_array, require_declared, require_inflated, require_memory, undamaged
 from .leftovers import is_hidden
 
@@ -143,18 +143,17 @@ def open_tiff(file: Path) -> Iterator[Any]:
     import tifffile
 
     require_regular(file, "a TIFF file")
-    try:
-        with tifffile.TiffFile(file) as opened:
-            yield opened
-    except (InputError, MemoryError):
-        raise
-    except Exception as error:  # tifffile raises many kinds for damaged files
-        if "imagecodecs" in str(error):
+    with undamaged(file, "a complete TIFF file"):
+        try:
+            with tifffile.TiffFile(file) as opened:
+                yield opened
+        except Exception as error:
+            if "imagecodecs" not in str(error):
+                raise
             raise MissingError(
                 f"{file} is compressed in a way that needs a package ({error}); install it by pip install "
                 '"holosplat[codecs]" (imagecodecs), or save the file without compression.'
             ) from None
-        raise InputError(f"{file} must be a complete TIFF file, but it is damaged or none: {error}.") from None
 
 
 def image_numbers(opened: Any, file: Path) -> list[int]:

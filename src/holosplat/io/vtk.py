@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from ..checks import InputError, require, require_regular
-from ..mesh import TriangleMesh
+from ..mesh import TriangleMesh, part_of
 from ..units import LENGTH_UNITS, unit_factor
 from .atomic import atomic_path
 from .guard import blocks_fault, cells_fault, legacy_fault, ply_fault, xml_fault
@@ -132,9 +132,9 @@ def _read_file(path: Path, factor: float) -> list[TriangleMesh]:
         f"{path} must hold a body of {SMALLEST:g} m or more, at most {FARTHEST:g} m from its origin, but it is of "
         f"{extent:.3g} m and reaches {farthest:.3g} m from it; correct its coordinates, or say their --length-unit.",
     )
-    named = parts or {_readable(path.name): faces}
-    whole = {name: TriangleMesh(points * factor, part, name) for name, part in named.items()}
-    meshes = [(_used(mesh) if parts else mesh).merged(MERGE_TOLERANCE * extent) for mesh in whole.values()]
+    whole = TriangleMesh(points * factor, faces, _readable(path.name))
+    named = [part_of(whole, part, name) for name, part in parts.items()] or [whole]
+    meshes = [mesh.merged(MERGE_TOLERANCE * extent) for mesh in named]
     if _ends_within_a_line(path) and not all(_is_closed(mesh.faces) for mesh in meshes):
         raise _damaged(path, "it ends in the middle of a line and its surface is not closed")
     return meshes
@@ -147,12 +147,6 @@ def _bodies(data: Any, faces: np.ndarray) -> dict[str, np.ndarray]:
         return {}
     of = numbers_of(numbers)
     return {f"{BODY}{number:03.0f}": faces[of == number] for number in np.unique(of)}
-
-
-def _used(mesh: TriangleMesh) -> TriangleMesh:
-    """The mesh without vertices of no triangle."""
-    used, faces = np.unique(mesh.faces, return_inverse=True)
-    return TriangleMesh(mesh.vertices[used], faces.reshape(-1, 3), mesh.name)
 
 
 def _readable(name: str) -> str:

@@ -19,6 +19,7 @@ from ..baselines.algebraic import Algebraic, sirt
 from ..baselines.beyond import margins_of
 from ..baselines.holographic_tv import Correction, retrieved
 from ..fit.whitened import WhitenedFrames
+from ..frames import evenly
 from ..geometry import Grid
 from ..matter import DeltaBeta, KnownRatio, MaterialPrior, Matter
 from ..memory import memory_kept
@@ -122,7 +123,7 @@ def first_picture(train: Scan, prior: MaterialPrior) -> VoxelGrid:
     for frames that cannot be retrieved.
     """
     one = train.at_instant(len(train.instants) // 2) if train.is_series else train
-    one = one[np.unique(np.linspace(0, len(one) - 1, min(len(one), PICTURE_VIEWS)).round().astype(int))]
+    one = one[evenly(len(one), PICTURE_VIEWS)]
     scan = one.binned(one.largest_binning(math.ceil(max(one.views.shape) / PICTURE_WIDTH)))
     ratio = prior.ratio if isinstance(prior, KnownRatio) else prior.delta_sign * PICTURE_RATIO
     delta = prior.delta_sign * 1e-6  # any: the thickness is found in its units

@@ -16,6 +16,7 @@ from ..baselines.tomography import plateau
 from ..checks import require
 from ..fit.smooth_volume import ContinuousPrior, VolumeProblem
 from ..fit.whitened import WhitenedFrames
+from ..frames import rfft_weights
 from ..geometry import Grid
 from ..matter import DeltaBeta
 from ..optics.noise import NoiseModel
@@ -115,10 +116,7 @@ class Ranges:
         self.radius = torch.hypot(torch.fft.fftfreq(h)[:, None], torch.fft.rfftfreq(w)).to(on)
         octaves = max(0, int(math.log2(0.5 * longest / WAVES)))
         self.limits = [*(0.5 / 2**k for k in range(octaves, 0, -1)), 1.0]
-        self._twice = torch.full((w // 2 + 1,), 2.0, device=on)
-        self._twice[0] = 1
-        if w % 2 == 0:
-            self._twice[-1] = 1
+        self._twice = torch.from_numpy(rfft_weights(w)).float().to(on)
 
     def by_range(self, u: Tensor, limits: list[float]) -> list[Told]:
         """What each range says of a volume u, each from where the narrower one before it has led."""

@@ -6,7 +6,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
-import numpy as np
 import torch
 
 from ..backends import Backend
@@ -15,6 +14,7 @@ from ..baselines.beyond import margins_of
 from ..baselines.material import DEFAULT, MaterialEstimate, level_of
 from ..checks import at_least, require
 from ..fit.smooth_volume import ContinuousPrior
+from ..frames import evenly
 from ..geometry import Grid
 from ..matter import DeltaBeta, KnownRatio, Matter
 from ..optics.retrieval.spectra import contrast_level
@@ -215,4 +215,4 @@ def in_few_views(task: Task) -> Task:
     most = VIEWS * EDGE**3 // min(rows * columns**2, EDGE**3)
     if len(task.scan) <= most:
         return task
-    return task.of_views(np.linspace(0, len(task.scan) - 1, most).round().astype(int))
+    return task.of_views(evenly(len(task.scan), most))

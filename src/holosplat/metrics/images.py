@@ -31,6 +31,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from ..checks import InputError, finite, positive, require, shaped
+from ..frames import rfft_weights
 
 FIXED_THRESHOLD = 0.143
 """The fixed threshold 1/7 between two half data sets (Rosenthal & Henderson 2003, J. Mol. Biol. 333, 721)."""
@@ -160,11 +161,7 @@ def _rings(shape: tuple[int, ...], spacing: Sequence[float] | np.ndarray | None)
     axes.append(np.fft.rfftfreq(shape[-1], steps[-1]))
     squared = sum(np.square(f * shortest) for f in np.meshgrid(*axes, indexing="ij", sparse=True))
     ring = np.floor(np.sqrt(squared) + (0.5 + 1e-9)).astype(np.intp)
-    weight = np.full(shape[-1] // 2 + 1, 2.0)  # the conjugate half is not stored ...
-    weight[0] = 1.0
-    if shape[-1] % 2 == 0:
-        weight[-1] = 1.0  # ... except the columns that are their own conjugates
-    return ring, np.broadcast_to(weight, ring.shape), last
+    return ring, np.broadcast_to(rfft_weights(shape[-1]), ring.shape), last
 
 
 SSIM_WINDOW = 11

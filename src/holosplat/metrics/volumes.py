@@ -12,7 +12,7 @@ import numpy as np
 
 from ..checks import InputError, require
 from ..geometry import Grid
-from ..mesh import TriangleMesh
+from ..mesh import TriangleMesh, areas
 from ..volume import Volume
 from .images import (
     FIXED_THRESHOLD,
@@ -202,9 +202,7 @@ def distances(points: np.ndarray, mesh: TriangleMesh) -> np.ndarray:
 
 
 def _mean_square(of: TriangleMesh, to: TriangleMesh) -> float:
-    a, b, c = np.moveaxis(of.vertices[of.faces], 1, 0)
-    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    weights = np.bincount(of.faces.ravel(), np.repeat(areas, 3), minlength=len(of.vertices))
+    weights = areas(of)
     used = weights > 0
     return float(np.average(distances(of.vertices[used], to) ** 2, weights=weights[used]))
 

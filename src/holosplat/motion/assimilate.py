@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ..checks import at_least, positive, require
 from ..matter import Matter
-from ..mesh import TriangleMesh
+from ..mesh import TriangleMesh, joined
 from ..metrics.volumes import normal_distance
 from ..model import Instrument, Model
 from ..ranges import ranged
@@ -131,8 +131,7 @@ class _Fit:
         cls, scan: Scan, model: CellModel, meshes: Sequence[TriangleMesh], matter: Matter, options: Assimilation
     ) -> _Fit:
         flow, nodes, bound = model.dressed(meshes)
-        starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
-        faces = torch.from_numpy(np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts)]))
+        faces = torch.from_numpy(joined(meshes).faces)
         ranges = {"peak": options.peak, "shear": options.shear}
         middle = {name: float(np.sqrt(low * high)) for name, (low, high) in ranges.items()}
         widths = {n: 0.25 * float(np.log(high / low)) for n, (low, high) in ranges.items() if high > low}

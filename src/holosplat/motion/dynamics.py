@@ -21,7 +21,6 @@ from ..specimens.flow.suspension import PLASMA_VISCOSITY
 from ..specimens.red_cells import RedCell
 from .cell_model import CellModel, ChannelFrame, Range
 from .forecast import Forecast, Halves, History, Model, PathForecast, extrapolate, on_paths, places_of, smoothed
-from .measures import area
 
 ALIKE = 0.3
 """A body whose volume differs from the median by more is no whole cell."""
@@ -173,8 +172,8 @@ def whole_cells(meshes: list[TriangleMesh], frame: ChannelFrame) -> list[int]:
         return []
     usual = np.median(volumes[within])
     alike = within & (np.abs(volumes / usual - 1) < ALIKE)
-    most = STRETCHED * area(rest) / rest.volume ** (2 / 3)
-    return [int(k) for k in np.flatnonzero(alike) if area(meshes[k]) < most * volumes[k] ** (2 / 3)]
+    most = STRETCHED * rest.area / rest.volume ** (2 / 3)
+    return [int(k) for k in np.flatnonzero(alike) if meshes[k].area < most * volumes[k] ** (2 / 3)]
 
 
 def _peak(

@@ -18,7 +18,6 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ..bodies.rest_shape import surface
 from ..checks import require
 from ..fit.problem import Batch, LossPart
 from ..fit.terms.object import squared_product
@@ -37,7 +36,7 @@ class Elastic:
     """The energy of bodies of one rest shape, a closed mesh, in units of its area times the shear modulus."""
 
     def __init__(self, mesh: TriangleMesh) -> None:
-        area, extent = surface(mesh), float((mesh.vertices.max(0) - mesh.vertices.min(0)).max())
+        area, extent = mesh.area, float((mesh.vertices.max(0) - mesh.vertices.min(0)).max())
         moduli = Elasticity(
             skalak_shear=1 / area,
             skalak_dilation=1.0,

@@ -315,6 +315,12 @@ def places_of(bodies: MovingSurfaces, times: np.ndarray) -> Places:
     return [bodies.unit_length * whole[:, bodies.body(k)[0].numpy()] for k in range(bodies.count)]
 
 
+def half_apart(bodies: MovingSurfaces, one: Places, other: Places) -> np.ndarray:
+    """[T, B] m: half of what two places of each of the `bodies` differ by along its normals, their standard error."""
+    faces = (bodies.body(k)[1].numpy() for k in range(bodies.count))
+    return 0.5 * np.stack([across(a, b, f) for a, b, f in zip(one, other, faces)], axis=1)
+
+
 def smoothed(
     bodies: MovingSurfaces, times: np.ndarray, ahead: np.ndarray, options: PathForecast, halves: Halves | None
 ) -> tuple[Places, np.ndarray]:
@@ -328,12 +334,9 @@ def smoothed(
     if halves is not None:
         both = _splits(halves[0], times, window, options), _splits(halves[1], times, window, options)
     found = _at(shrunk(splits, both), bodies, ahead, window, options)
-    spread = np.zeros((len(ahead), bodies.count))
-    if both is not None:
-        first, second = (_at(shrunk(one, both), bodies, ahead, window, options) for one in both)
-        for k, (one, other) in enumerate(zip(first, second)):
-            spread[:, k] = 0.5 * across(one, other, bodies.body(k)[1].numpy())
-    return found, spread
+    if both is None:
+        return found, np.zeros((len(ahead), bodies.count))
+    return found, half_apart(bodies, *(_at(shrunk(one, both), bodies, ahead, window, options) for one in both))
 
 
 def _splits(bodies: MovingSurfaces, times: np.ndarray, window: Window, options: PathForecast) -> list[Split]:

@@ -18,6 +18,7 @@ from ..bodies.search import BodySearch, sized
 from ..bodies.shadows import Shadows
 from ..checks import require
 from ..fit.run import Run
+from ..frames import evenly
 from ..geometry import Views
 from ..inference import ERRORS, Compared, Decision, Score
 from ..matter import DeltaBeta, Matter
@@ -41,7 +42,7 @@ class KnownBodies:
         times, self.pixel = train.instants, train.views.pixel_size
         self.material, self.body, self.size = material, body, size
         self.first, self.last = float(times[0]), float(times[-1])
-        chosen = times[np.unique(np.rint(np.linspace(0, len(times) - 1, body.instants)).astype(int))]
+        chosen = times[evenly(len(times), body.instants)]
         frames = train[np.flatnonzero(np.isin(train.exposures.time, chosen))]
         self.fine = body.mesh(self.pixel)
         self.search = BodySearch.of(frames, material, body, (self.first, self.last))

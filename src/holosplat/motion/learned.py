@@ -27,12 +27,12 @@ from torch import Tensor, nn
 from ..checks import InputError, as_written, require
 from ..io.atomic import atomic_path
 from ..learning.start import Card, card_of, size_of, tensors_of
-from ..mesh import TriangleMesh, across
+from ..mesh import TriangleMesh
 from ..ranges import ManyOrNone, Natural, ranged
 from ..representations import MovingSurfaces
 from ..specimens.flow.suspension import PLASMA_VISCOSITY
 from ..specimens.membrane.model import Elasticity
-from .forecast import Forecast, Halves, History, Model, of_volume, on_paths, places_of
+from .forecast import Forecast, Halves, History, Model, half_apart, of_volume, on_paths, places_of
 
 SHIPPED, VERSION = Path(__file__).with_name("flowing_cells.safetensors"), "dynamics 1"
 DEGREE = 4
@@ -325,7 +325,9 @@ def learned(
     places = places_of(bodies, known)
     horizon = torch.from_numpy(np.r_[0.0, (ahead - known[-1]) / length])
     faces = [bodies.body(k)[1].numpy() for k in range(bodies.count)]
-    noise = _noise(halves, known[-1:], faces)
+    noise = np.zeros(bodies.count)
+    if halves is not None:
+        (noise,) = half_apart(bodies, *(places_of(half, known[-1:]) for half in halves))
     states = [State.of(one, faces[k], known, noise[k]) for k, one in enumerate(places)]
     scene, radii = _scene(states, length)
     with torch.no_grad():
@@ -340,14 +342,6 @@ def learned(
         said.append(later)
     band = (radii[:, None] * errors.square().mean(1).sqrt()).T.numpy()
     return Forecast(on_paths(bodies, np.r_[known[-1], ahead], said), ahead, band)
-
-
-def _noise(halves: Halves | None, last: np.ndarray, faces: list[np.ndarray]) -> np.ndarray:
-    """[B] m, standard error of each body's surface at the last time: half of what two half-sets differ by."""
-    if halves is None:
-        return np.zeros(len(faces))
-    one, other = (places_of(half, last) for half in halves)
-    return np.array([0.5 * across(a, b, f)[0] for a, b, f in zip(one, other, faces)])
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from ..bodies.rest_shape import moments
 from ..checks import require
 from ..fit.run import Record, Run
 from ..geometry import Views
-from ..mesh import TriangleMesh
+from ..mesh import TriangleMesh, vector_areas
 from ..optics.background import Light
 from ..representations import MovingSurfaces, TimeBasis
 from ..scan import Exposures, Scan
@@ -80,7 +80,7 @@ def measure(mesh: TriangleMesh, speed: np.ndarray, time: float, number: int, vie
     c, b, a = np.sqrt(5 * np.maximum(values, 0))
     seen = np.array([_in_field(mesh.vertices, views[[v]]) for v in range(len(views))]).any(0).mean()
     spin = angular_velocity(mesh, speed)
-    place = (*centre, *volume_velocity(mesh, speed), volume, area(mesh))
+    place = (*centre, *volume_velocity(mesh, speed), volume, mesh.area)
     shape = (a, b, c, *axes[:, 0], (a - b) / (a + b), (a - c) / (a + c))
     return Measures(time, number, *(float(value) for value in (*place, *shape, *spin, seen)))
 
@@ -90,15 +90,10 @@ def row(of: Measures) -> list[str]:
     return [str(v) if isinstance(v, int) else f"{v:.7g}" for v in astuple(of)]
 
 
-def area(mesh: TriangleMesh) -> float:
-    """Area of the surface [m²]."""
-    return float(np.linalg.norm(_normals(mesh), axis=1).sum())
-
-
 def volume_velocity(mesh: TriangleMesh, speed: np.ndarray) -> np.ndarray:
     """Velocity [3] [m/s] of the centre of the volume: (∫ (x - c) (v · n) dA) / V (Reynolds' transport theorem)."""
     volume, centre, _ = moments(mesh)
-    corners, normals = (mesh.vertices - centre)[mesh.faces], _normals(mesh)
+    corners, normals = (mesh.vertices - centre)[mesh.faces], vector_areas(mesh)
     through = np.einsum("fci,fi->fc", speed[mesh.faces], normals)
     # of linear functions f, g on a triangle: ∫ f g = A/12 (Σ fᵢ gᵢ + Σ fᵢ Σ gᵢ)
     sums = np.einsum("fci,fc->i", corners, through) + np.einsum("fi,f->i", corners.sum(1), through.sum(1))
@@ -107,17 +102,11 @@ def volume_velocity(mesh: TriangleMesh, speed: np.ndarray) -> np.ndarray:
 
 def angular_velocity(mesh: TriangleMesh, speed: np.ndarray) -> np.ndarray:
     """Angular velocity [3] [rad/s] of the rigid motion nearest to the velocities `speed` [P, 3] on the surface."""
-    weights = np.bincount(mesh.faces.ravel(), np.repeat(np.linalg.norm(_normals(mesh), axis=1) / 3, 3))
+    weights = np.bincount(mesh.faces.ravel(), np.repeat(np.linalg.norm(vector_areas(mesh), axis=1) / 3, 3))
     weights = weights / weights.sum()
     arms, speeds = (values - weights @ values for values in (mesh.vertices, speed))
     inertia = np.einsum("p,pk,pk->", weights, arms, arms) * np.eye(3) - np.einsum("p,pi,pj->ij", weights, arms, arms)
     return np.linalg.solve(inertia, weights @ np.cross(arms, speeds))
-
-
-def _normals(mesh: TriangleMesh) -> np.ndarray:
-    """Vector areas [F, 3] [m²]."""
-    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
-    return 0.5 * np.cross(b - a, c - a)
 
 
 def _in_field(points: np.ndarray, view: Views) -> np.ndarray:

@@ -27,7 +27,6 @@ from ..checks import require
 from ..mesh import TriangleMesh, areas, normals
 from ..specimens.flow.suspension import Channel, Medium, Suspension, contact_forces, wall_forces
 from ..specimens.membrane.model import Elasticity, Membrane
-from .measures import area
 
 STIFFNESS = (1e-6, 3e-6, 1e-5, 3e-5, 1e-4, 1e-4, 1e-4)
 """Springs between the surfaces [N/m a node], one round after the other: at the last one, forces of the membrane, some
@@ -99,10 +98,10 @@ def _frames(corners: torch.Tensor) -> torch.Tensor:
 def _on_surface(mesh: TriangleMesh, membrane: Membrane) -> np.ndarray:
     """Nodes [P, 3] [m] on the surface `mesh`, whose area and volume the membrane takes on."""
     own = Membrane(membrane.mesh, membrane.elasticity)
-    whole = {"surface": torch.tensor(area(mesh)), "volume": torch.tensor(mesh.volume)}
+    whole = {"surface": torch.tensor(mesh.area), "volume": torch.tensor(mesh.volume)}
     own.rest = replace(own.rest, **{name: value.double() for name, value in whole.items()})
     tree, outward = KDTree(mesh.vertices), normals(mesh)
-    weights = areas(mesh) * len(membrane.mesh.vertices) / area(mesh)
+    weights = areas(mesh) * len(membrane.mesh.vertices) / mesh.area
     nodes = _placed(mesh, membrane.mesh)
     for stiffness in STIFFNESS:
         near, back = tree.query(nodes)[1], KDTree(nodes).query(mesh.vertices)[1]

@@ -18,10 +18,9 @@ from scipy.interpolate import CubicSpline
 
 from ..checks import MissingError, require
 from ..inference import Decision, Score, select
-from ..mesh import across
 from ..ranges import ManyOrNone, ranged
 from ..representations import MovingSurfaces
-from .forecast import Forecast, Halves, History, Model, Places, places_of, told_by
+from .forecast import Forecast, Halves, History, Model, Places, half_apart, places_of, told_by
 
 ORDERS: dict[str, tuple[tuple[int, int], ...]] = {
     "dmd": ((2, 2), (3, 2), (4, 2), (4, 4), (6, 4)),
@@ -64,12 +63,9 @@ class ModesForecast:
             bodies: MovingSurfaces, times: np.ndarray, ahead: np.ndarray, halves: Halves | None
         ) -> tuple[Places, np.ndarray]:
             found = _places(bodies, times, ahead, chosen, one)
-            spread = np.zeros((len(ahead), bodies.count))
-            if halves is not None:
-                both = [_places(half, times, ahead, chosen, one) for half in halves]
-                for k, (first, second) in enumerate(zip(*both)):
-                    spread[:, k] = 0.5 * across(first, second, bodies.body(k)[1].numpy())
-            return found, spread
+            if halves is None:
+                return found, np.zeros((len(ahead), bodies.count))
+            return found, half_apart(bodies, *(_places(half, times, ahead, chosen, one) for half in halves))
 
         def ahead(times: np.ndarray) -> Forecast:
             return told_by(say, history.bodies, window, times, history.halves, MIDDLE)

@@ -13,6 +13,7 @@ from scipy.ndimage import maximum_filter
 from torch import Tensor
 
 from ..checks import at_least, in_range, require, shaped
+from ..frames import block_means
 from ..optics.resampling import InLine
 from ..ranges import Signed, ranged
 from .track_linking import LinkOptions, Seen, identified, path_degree
@@ -69,9 +70,8 @@ class _Hologram:
     """
 
     def __init__(self, frames: np.ndarray, optics: InLine, options: ParticleOptions) -> None:
-        bins, (rows, columns) = options.bins, frames.shape[1:]
-        cut = frames[:, : rows // bins * bins, : columns // bins * bins]
-        binned = cut.reshape(len(cut), rows // bins, bins, columns // bins, bins).mean(axis=(2, 4))
+        bins = options.bins
+        binned = block_means(frames, bins)
         self.frames = torch.from_numpy(np.ascontiguousarray(binned)).float()
         self.pitch, self.options, self.optics = bins * optics.pixel, options, optics
         far = max(optics.distances) - options.depth[0]

@@ -12,6 +12,7 @@ from scipy.ndimage import map_coordinates
 from torch import Tensor
 
 from ..checks import require
+from ..frames import rfft_weights
 from .air import find_air, has_air
 from .patterns import smooth_modes
 
@@ -311,8 +312,4 @@ def _parzen(distance: Tensor) -> Tensor:
 def _mean_power(power: Tensor, shape: tuple[int, int]) -> Tensor:
     """Mean [V] over all frequencies of a spectrum [V, H, W//2 + 1] of real images of `shape` (H, W)."""
     rows, columns = shape
-    weight = torch.full((columns // 2 + 1,), 2.0, dtype=power.dtype)
-    weight[0] = 1.0
-    if columns % 2 == 0:
-        weight[-1] = 1.0
-    return (power * weight).sum(dim=(1, 2)) / (rows * columns)
+    return (power * torch.from_numpy(rfft_weights(columns)).to(power.dtype)).sum(dim=(1, 2)) / (rows * columns)

@@ -18,6 +18,7 @@ import numpy as np
 
 from ..baselines import HolographicTV
 from ..checks import InputError, UnsaidError
+from ..frames import evenly
 from ..geometry import Views
 from ..io.angles import SAME_DEG, angles_of
 from ..io.facts import Facts, keys_of
@@ -115,18 +116,13 @@ def _with_few_fields(kinds: np.ndarray) -> np.ndarray:
     kept = kinds.copy()
     for kind in (FLAT, DARK):
         numbers = np.flatnonzero(kinds == kind)
-        kept[np.setdiff1d(numbers, evenly(numbers, FIELDS))] = INVALID
+        kept[np.setdiff1d(numbers, numbers[evenly(len(numbers), FIELDS)])] = INVALID
     return kept
-
-
-def evenly(numbers: np.ndarray, most: int) -> np.ndarray:
-    """At most so many of `numbers`, the first and the last among them."""
-    return numbers[np.unique(np.linspace(0, len(numbers) - 1, most).round().astype(int))] if len(numbers) else numbers
 
 
 def _facts(path: Path, reading: Reading, loader: Loader, opened: Opened, unsaid: Unsaid) -> ScanFacts:
     scan, file = reading.applied(opened[0]), opened[1]
-    numbers = evenly(np.arange(len(scan)), LOOKED)
+    numbers = evenly(len(scan), LOOKED)
     own = reading.applied(opened[0], joined=False) if "heightened" in scan.provenance else scan
     look = looked(np.asarray(own.source[numbers]))
     rows = {"what": f"a scan: {loader.mark} ({loader.name})"} | keys_of(path) | _frames(scan, file)

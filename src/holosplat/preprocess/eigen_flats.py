@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..checks import require
+from ..frames import block_means
 
 ROWS = 64
 """Rows of all flat frames held at once."""
@@ -148,17 +149,17 @@ class TotalVariationWeights:
         fits = min(flats.mean.shape) >= 2 * binning
         require(fits, f"binning must leave at least 2 × 2 pixels of {flats.mean.shape}, but it is {binning}.")
         self.binning = binning
-        self.mean = _binned(flats.mean, binning)
+        self.mean = block_means(flats.mean, binning)
         # In units of a standard deviation each, so that all weights are of order one.
         self.components = np.empty((len(flats), *self.mean.shape))
         for k, (deviation, component) in enumerate(zip(flats.deviations, flats.components)):
-            self.components[k] = _binned(deviation * component, binning)
+            self.components[k] = block_means(deviation * component, binning)
         self.deviations = flats.deviations
         self._inverse = np.linalg.pinv(self.components.reshape(len(flats), self.mean.size).T)
 
     def __call__(self, light: np.ndarray) -> np.ndarray:
         """Weights [K] for a dark-subtracted frame `light` [H, W], to be used with `EigenFlats.light`."""
-        frame = _binned(light, self.binning)
+        frame = block_means(light, self.binning)
         frame = np.maximum(frame, FAINTEST * frame.mean())
         if len(self.components) == 0:
             return np.zeros(0)
@@ -204,9 +205,3 @@ def _slopes(image: np.ndarray, edge: float = 0.0) -> tuple[np.ndarray, np.ndarra
     down = np.diff(image, axis=0, append=image[-1:])
     right = np.diff(image, axis=1, append=image[:, -1:])
     return down, right, np.sqrt(down**2 + right**2 + edge**2)
-
-
-def _binned(image: np.ndarray, factor: int) -> np.ndarray:
-    """Means over `factor × factor` pixels; rows and columns that do not fill one are cut."""
-    h, w = (n // factor for n in image.shape)
-    return image[: h * factor, : w * factor].reshape(h, factor, w, factor).mean((1, 3))

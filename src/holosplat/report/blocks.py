@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from ..frames import evenly
 from ..metrics import VolumeScores
 from ..units import beam_named, in_percent, plain, wavenumber
 from ..volume import Volume
@@ -15,7 +16,6 @@ from ..workflows.verdict import Verdict
 from .content import UNSURE, GuessShown, ReportContent
 from .curves import correlation_figure, histogram_figure, history_figure
 from .figures import (
-    evenly_chosen,
     held_out_figure,
     matter_block,
     plane_sizes,
@@ -139,7 +139,7 @@ def _held_out(content: ReportContent) -> Block:
     if views is None:
         return Block(heading, "No view was held out of the fit, so no prediction could be tested.")
     figure = held_out_figure(views, content.pixel_size, MOST_VIEWS)
-    count, chosen = len(views.labels), evenly_chosen(len(views.labels), MOST_VIEWS)
+    count, chosen = len(views.labels), evenly(len(views.labels), MOST_VIEWS).tolist()
     which = f"{len(chosen)} of {count}" if len(chosen) < count else f"all {count}" if count > 1 else "the one"
     (low, high), limit = grey_limits(views.measured), largest(views.predicted - views.measured)
     error = float(np.sqrt(np.mean(np.square(np.subtract(views.predicted, views.measured, dtype=np.float64)))))

@@ -14,6 +14,7 @@ from ..geometry import Grid, Views
 from ..inference import Decision
 from ..metrics import ImageScores, VolumeScores, require_same_grid, robust_material_delta
 from ..representations import MovingSurfaces
+from ..rotations import angles_about_y
 from ..units import in_percent, wavenumber
 from ..volume import Volume
 from ..workflows.rehearsal import Rehearsal
@@ -316,7 +317,7 @@ def view_labels(views: Views) -> tuple[str, ...]:
         return tuple(f"view {k + 1}, pixels of {1e6 * p:.4g} µm" for k, p in enumerate(views.pixel_sizes))
     if not views.shares_axis:
         return tuple(f"view {k + 1}" for k in range(len(views)))
-    angles = _along_one_arc(np.degrees(np.arctan2(views.rotations[:, 0, 2], views.rotations[:, 0, 0])) % 360.0)
+    angles = _along_one_arc(np.degrees(angles_about_y(views.rotations)) % 360.0)
     return tuple(f"θ = {round(float(angle), 1) + 0.0:.1f}°".replace("-", "−") for angle in angles)
 
 

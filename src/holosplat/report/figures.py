@@ -13,6 +13,7 @@ from matplotlib.colors import Normalize, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
+from ..frames import evenly
 from ..geometry import Grid
 from ..units import in_percent, length_unit, plain, wavenumber
 from ..volume import Volume
@@ -106,7 +107,7 @@ def _surface_panel(axes: Axes, shown: SurfaceImage, grid: Grid) -> None:
 @styled
 def held_out_figure(views: HeldOutViews, pixel_size: float, most: int = 4) -> Figure:
     """Measured, predicted and residual intensity of up to `most` test views; pixel_size [m]."""
-    chosen = evenly_chosen(len(views.labels), most)
+    chosen = evenly(len(views.labels), most).tolist()
     low, high = grey_limits(views.measured)
     limit = largest(views.predicted - views.measured)
     scale, power = decimal_scale(limit)
@@ -126,11 +127,6 @@ def held_out_figure(views: HeldOutViews, pixel_size: float, most: int = 4) -> Fi
     panels.bar(grey, 1, (0, len(chosen) - 1), "intensity relative to the flat field", "both")
     panels.bar(signed, 2, (0, len(chosen) - 1), f"difference of intensity{f' ({power})' if power else ''}", "both")
     return panels.figure
-
-
-def evenly_chosen(count: int, most: int) -> list[int]:
-    """At most `most` of `count` indices, evenly spread, the first and the last among them."""
-    return sorted({round(i) for i in np.linspace(0, count - 1, min(count, most))})
 
 
 @styled

@@ -10,11 +10,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
+from ..frames import evenly
 from ..optics.sampling import fringes
 from ..planning.look import Spectrum
 from ..planning.scan_facts import OPTICS, ScanFacts
 from .content import LitViews, pixel_of
-from .figures import evenly_chosen
 from .style import (
     FAINT,
     HOLOGRAM_MAP,
@@ -63,11 +63,11 @@ def phase_figure(
 
     pixel_sizes: [V] [m].
     """
-    chosen = evenly_chosen(len(measured), most)
+    chosen = evenly(len(measured), most)
     phase, limits = phase[chosen], grey_limits(phase[chosen], (0.02, 99.98))
     factor = np.ones_like(phase) if light is None else light[chosen]
     third = (phase, from_dark(PHASE_MAP, limits), limits, "Phase", "phase (rad)")
-    return _beside(measured[chosen], factor, third, [labels[n] for n in chosen], pixel_sizes[chosen].tolist())
+    return _beside(measured[chosen], factor, third, [labels[int(n)] for n in chosen], pixel_sizes[chosen].tolist())
 
 
 def _beside(

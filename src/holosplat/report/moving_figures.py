@@ -13,9 +13,9 @@ from matplotlib.patches import Polygon, Rectangle
 from PIL import Image, features
 from scipy.spatial import ConvexHull
 
+from ..frames import evenly
 from ..geometry import Grid
 from .content import Moving
-from .figures import evenly_chosen
 from .style import (
     FAINT,
     HOLOGRAM_MAP,
@@ -118,7 +118,7 @@ def _limits(values: np.ndarray, whole: np.ndarray) -> Limits:
 @styled
 def film_figure(moving: Moving) -> Figure:
     """Bodies, measured and predicted frames, and their difference, at a few times, all seen along one beam."""
-    chosen = evenly_chosen(len(moving.shown), STRIP)
+    chosen = evenly(len(moving.shown), STRIP).tolist()
     height, width = moving.measured.shape[1:]
     panels = PanelGrid(4, [width] * len(chosen), [height] * len(chosen), (len(chosen) - 1,))
     grey, limit = grey_limits(moving.measured), largest(moving.predicted - moving.measured)

@@ -11,7 +11,8 @@ import numpy as np
 
 from ..io.atomic import atomic_path
 from ..units import XRAYS_KEV, beam_named, in_percent
-from ..workflows.next_step import NULL, Step, next_step
+from ..workflows.certainty import NULL
+from ..workflows.next_step import Step, next_step
 from ..workflows.rehearsal import Rehearsal
 from .blocks import make_blocks
 from .content import Moving, ReportContent, flatten

@@ -11,6 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 
+from ..frames import evenly
 from ..planning.plan import NEARLY, WANTED_SNR, Survey
 from .style import (
     CYCLE,
@@ -130,7 +131,7 @@ def _distance(metres: float) -> str:
 def _distance_panel(axes: Axes, survey: Survey) -> None:
     """Signal to noise over the distance, one curve an energy."""
     count = len(survey.energies_kev)
-    shown = sorted({*np.linspace(0, count - 1, min(count, MOST_CURVES)).round().astype(int).tolist()})
+    shown = evenly(count, MOST_CURVES).tolist()
     # Light blue to dark blue: energies have an order.
     colours = matplotlib.colormaps["YlGnBu"](np.linspace(0.95, 0.5, len(shown)))
     for e, colour in zip(shown, colours if count > 1 else [CYCLE[0]]):

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from ..checks import as_written
+from ..frames import evenly
 from ..geometry import Grid, Views
 from ..io.atomic import read_json
 from ..io.volumes import read_guess
@@ -33,7 +34,6 @@ from ..workflows.rehearsal import read_rehearsal
 from ..workflows.run_folder import RunFolder
 from ..workflows.track import read_errors
 from .content import GuessShown, HeldOutViews, LitViews, Moving, ProjectedMaps, ReportContent, view_labels
-from .figures import evenly_chosen
 from .page import write_report
 from .style import ENDS, data_uri, new_figure, styled
 from .surface import ForecastShown
@@ -217,7 +217,7 @@ def _lit(reconstruction: Reconstruction, scan: Scan, evaluation: Evaluation) -> 
     if light is None or scan.is_test.all():
         return None
     train = np.flatnonzero(~scan.is_test)
-    chosen = train[evenly_chosen(len(train), MOST_LIT)]
+    chosen = train[evenly(len(train), MOST_LIT)]
     shown = scan[chosen]
     predicted = render(reconstruction, shown.exposures)
     measured, part = shown.measured, light.part(torch.from_numpy(chosen))
@@ -256,7 +256,7 @@ def moving_of(
     assert isinstance(done.object, MovingSurfaces)
     when, order = scan.exposures.time, np.argsort(scan.is_test, kind="stable")  # frames for training first
     times = np.unique(when)
-    shown = np.array(evenly_chosen(len(times), MOST_FRAMES))
+    shown = evenly(len(times), MOST_FRAMES)
     chosen = np.array([order[np.flatnonzero(when[order] == times[t])[0]] for t in shown])
     predicted = render(done, scan.exposures[chosen])
     if light is not None:

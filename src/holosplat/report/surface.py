@@ -23,7 +23,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinat
 
 from ..checks import require, shaped
 from ..geometry import Grid, rotation_y
-from ..mesh import TriangleMesh
+from ..mesh import TriangleMesh, sums_of_areas, vector_areas
 from .style import CYCLE, INK, WIDTH, Block, drawn_block, letter, new_figure, styled
 
 STEP = 0.5  # voxels a ray advances near matter
@@ -270,10 +270,10 @@ def paint_bodies(
     corners, paints, depths = [], [], []
     for mesh, colour in zip(meshes, colours):
         points = UNIT * (mesh.vertices @ np.asarray(rotation).T - np.array([*shift, 0.0]))
-        normals = _vertex_normals(points, mesh.faces)[mesh.faces].mean(1)
+        seen_as = TriangleMesh(points, mesh.faces)
+        normals = sums_of_areas(seen_as)[mesh.faces].mean(1)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-        a, b, c = np.moveaxis(points[mesh.faces], 1, 0)
-        seen = np.cross(b - a, c - a)[:, 2] < 0
+        seen = vector_areas(seen_as)[:, 2] < 0
         corners.append(points[mesh.faces][seen])
         paints.append(_shaded(np.array(colour), normals[seen]))
         depths.append(corners[-1][:, :, 2].mean(1))
@@ -282,13 +282,6 @@ def paint_bodies(
     drawn = PolyCollection(list(faces[:, :, :2]), facecolors=paint, edgecolors=paint, linewidths=0.25)
     axes.add_collection(drawn, autolim=False)
     return drawn
-
-
-def _vertex_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """[P, 3], the sums of the vector areas of the triangles around."""
-    a, b, c = np.moveaxis(points[faces], 1, 0)
-    across = np.repeat(np.cross(b - a, c - a), 3, axis=0)
-    return np.stack([np.bincount(faces.ravel(), across[:, axis], len(points)) for axis in range(3)], axis=1)
 
 
 def _shaded(colour: np.ndarray, normals: np.ndarray) -> np.ndarray:

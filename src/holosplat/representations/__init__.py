@@ -39,11 +39,6 @@ class Stored(TrainableObject, Protocol):
         """How large it is, in words."""
         ...
 
-    @property
-    def stored_bytes(self) -> int:
-        """Size of what has to be stored of it."""
-        ...
-
     def with_parameters(self, parameters: Mapping[str, Tensor]) -> Stored:
         """The same object with other tensors in the place of those named."""
         ...

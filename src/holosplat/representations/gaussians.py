@@ -88,11 +88,6 @@ class GaussianCloud:
         """How large the cloud is, in words."""
         return f"{len(self)} Gaussians"
 
-    @property
-    def stored_bytes(self) -> int:
-        """Size of the parameters as a run folder stores them, float32."""
-        return 4 * sum(p.numel() for p in self.parameters().values())
-
     def replaced(self, parameters: Iterable[Tensor], matter: Matter | None = None) -> Self:
         """A cloud of other tensors in the same units, of the same matter or another."""
         cloud = type(self)(parameters, self.unit_length, matter or self.matter)

@@ -184,11 +184,6 @@ class MovingGaussians:
         of = f"degree {basis.degree}" + (f" in {basis.pieces} pieces" if basis.pieces > 1 else "")
         return f"{len(self)} Gaussians carried by a flow of {x} × {y} × {z} nodes and {of} in time"
 
-    @property
-    def stored_bytes(self) -> int:
-        """Size of the parameters as a run folder stores them, float32."""
-        return 4 * sum(p.numel() for p in self.parameters().values())
-
     def enclosing_grid(self, most_voxels: int) -> Grid:
         """A grid around all centres at the first, the last and the reference time."""
         basis = self.flow.basis

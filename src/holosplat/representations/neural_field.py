@@ -16,7 +16,7 @@ from torch.func import functional_call
 from torch.nn.functional import max_pool3d, softplus
 
 from ..backends import device
-from ..checks import at_least, require
+from ..checks import at_least, require, require_shapes
 from ..display import of_object
 from ..geometry import Grid, Poses, Views
 from ..matter import Matter
@@ -181,7 +181,7 @@ class NeuralField:
         lowest = {"lower": float(state.get("lower", 0.0))}  # runs before matter of both sides have none
         field = cls(grid, Matter.from_dict(state["matter"]), network, state["mask"], 0, float(state["upper"]), **lowest)
         for name, mine in (("weights", field._weights), ("constants", field._constants)):
-            _require_shapes(name, state.get(name, {}), mine)
+            require_shapes(f"{name}/{{}} of the network", state.get(name, {}), mine)
         field._constants = dict(state.get("constants", {}))
         return field.with_parameters(state["weights"])
 
@@ -189,11 +189,6 @@ class NeuralField:
     def described(self) -> str:
         """How large the field is, in words."""
         return f"a field of {sum(p.numel() for p in self._weights.values())} weights"
-
-    @property
-    def stored_bytes(self) -> int:
-        """Size of the weights as float16, and of the mask in bits."""
-        return 2 * sum(p.numel() for p in self._weights.values()) + self.mask.numel() // 8
 
     def enclosing_grid(self, most_voxels: int) -> Grid:
         """The grid of the field, whatever its size."""
@@ -345,15 +340,6 @@ class NeuralField:
         """The mask becomes `mask` [Z, Y, X], in all copies that share it; samples that were ready are found anew."""
         self.mask.copy_(mask)
         self._samples.clear()
-
-
-def _require_shapes(what: str, given: Mapping[str, Tensor], wanted: Mapping[str, Tensor]) -> None:
-    for name in {**wanted, **given}:
-        shapes = [tuple(found.shape) if (found := table.get(name)) is not None else None for table in (wanted, given)]
-        require(
-            shapes[0] == shapes[1],
-            f"{what}/{name} of the network must have the shape {shapes[0]}, but it has {shapes[1]}.",
-        )
 
 
 def uniform(generator: torch.Generator, *shape: int) -> Tensor:

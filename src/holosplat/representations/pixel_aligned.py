@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 from ..backends import in_main_memory
-from ..checks import positive, require
+from ..checks import positive, require, require_shapes
 from ..display import of_object
 from ..geometry import Grid, Poses, Views
 from ..matter import Matter
@@ -63,7 +63,7 @@ class PixelAlignedField:
         require(shape == grid.shape, f"the mask must have the grid's shape {grid.shape}, but it has {shape}.")
         require(upper >= 0, f"upper must not be negative, but it is {upper:g}.")
         self._net = PixelAligned(network)
-        _require_shapes(weights, dict(self._net.named_parameters()))
+        require_shapes("weights/{} of the network", weights, dict(self._net.named_parameters()))
         self.weights = {name: weights[name].detach() for name, _ in self._net.named_parameters()}
         self.images, self.views, self.mask, self.grid, self.matter = images, views, mask.bool(), grid, matter
         self.network, self.upper, self.backend = network, float(upper), "cuda" if images.is_cuda else "cpu"
@@ -138,12 +138,6 @@ class PixelAlignedField:
         weights = sum(weight.numel() for weight in self.weights.values())
         return f"a field of {weights} weights on {len(self.images)} views"
 
-    @property
-    def stored_bytes(self) -> int:
-        """Size of the weights and images as float16, and of the mask in bits."""
-        weights = sum(weight.numel() for weight in self.weights.values())
-        return 2 * (weights + self.images.numel()) + self.mask.numel() // 8
-
     def enclosing_grid(self, most_voxels: int) -> Grid:
         """The grid of the field, whatever its size."""
         return self.grid
@@ -207,12 +201,3 @@ def places_of(grid: Grid, views: Views, cells: Tensor, dtype: torch.dtype = torc
         depth = (points - middle) @ turn[2] / half
         place[:, 0], place[:, 1], place[:, 2] = across[:, 0] / w, across[:, 1] / h, depth
     return found
-
-
-def _require_shapes(given: Mapping[str, Tensor], wanted: Mapping[str, Tensor]) -> None:
-    for name in {**wanted, **given}:
-        shapes = [tuple(table[name].shape) if name in table else None for table in (wanted, given)]
-        require(
-            shapes[0] == shapes[1],
-            f"weights/{name} of the network must have the shape {shapes[0]}, but it has {shapes[1]}.",
-        )

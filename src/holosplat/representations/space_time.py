@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 from ..backends import in_main_memory
-from ..checks import positive, require
+from ..checks import positive, require, require_shapes
 from ..display import of_object
 from ..geometry import Grid, Poses, Views
 from ..matter import Matter
@@ -26,6 +26,8 @@ from .voxels import VoxelGrid, along_axes
 
 FLOW = "flow."
 """Before the names of the velocity's weights."""
+COEFFICIENTS = "coefficients"
+"""The name of those of the occupancy's splines."""
 EMPTIEST = 0.01
 """Distance of an occupancy from its bounds, as a share of them, that a start may have: beyond it nothing pulls."""
 
@@ -84,10 +86,6 @@ class Frame:
         """Points [P, 3] [m] in these units."""
         return (points - torch.tensor(self.middle).to(points)) / self.half
 
-    def metres(self, points: Tensor) -> Tensor:
-        """The points [P, 3] [m] of ones in these units."""
-        return points * self.half + torch.tensor(self.middle).to(points)
-
 
 class SpaceTimeField:
     """Matter on the box of `grid` (cubic voxels) that a velocity field carries, or that changes as it likes.
@@ -121,9 +119,8 @@ class SpaceTimeField:
         require(upper >= 0, f"upper must not be negative, but it is {upper:g}.")
         require(basis.first < basis.last, "a space-time field needs times that grow; give two or more.")
         self.lattice = lattice_of(grid, options.cell_px)
-        _require_shapes({"coefficients": coefficients}, {"coefficients": (basis.count, *self.lattice.counts)})
-        started = options.velocity.started(0)
-        _require_shapes(weights, {name: tuple(weight.shape) for name, weight in started.items()})
+        wanted = {COEFFICIENTS: torch.empty(basis.count, *self.lattice.counts), **options.velocity.started(0)}
+        require_shapes("{} of a space-time field", {**weights, COEFFICIENTS: coefficients}, wanted)
         self.coefficients, self.grid, self.basis, self.matter = coefficients, grid, basis, matter
         self.weights, self.options, self.upper, self.backend = dict(weights), options, float(upper), "cpu"
         self.frame = Frame.of(grid, basis)
@@ -236,11 +233,6 @@ class SpaceTimeField:
         flow = "without divergence" if self.options.velocity.solenoidal else "with free components"
         return f"a field of {x} × {y} × {z} nodes and {self.basis.count} in time, and a flow {flow}"
 
-    @property
-    def stored_bytes(self) -> int:
-        """Size of the parameters as a run folder stores them, float32."""
-        return 4 * sum(p.numel() for p in self.parameters().values())
-
     def enclosing_grid(self, most_voxels: int) -> Grid:
         """The grid itself, whatever its size."""
         return self.grid
@@ -321,12 +313,3 @@ def _axes(lattice: Lattice, grid: Grid) -> tuple[Tensor, Tensor, Tensor]:
         found.append(lattice.weights(places, axis, 0)[0].float())
     x, y, z = found
     return z, y, x
-
-
-def _require_shapes(given: Mapping[str, Tensor], wanted: Mapping[str, tuple[int, ...]]) -> None:
-    for name in {**wanted, **given}:
-        shape = tuple(given[name].shape) if name in given else None
-        require(
-            shape == wanted.get(name),
-            f"{name} of a space-time field must have the shape {wanted.get(name)}, but it has {shape}.",
-        )

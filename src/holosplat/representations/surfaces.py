@@ -15,7 +15,7 @@ from ..checks import InputError, positive, require
 from ..display import of_object
 from ..geometry import Grid, Poses, Views
 from ..matter import Matter
-from ..mesh import TriangleMesh, shell_labels, winding_number
+from ..mesh import TriangleMesh, joined, part_of, shell_labels, winding_number
 from ..projectors.surface import surface_occupancy, surface_thickness
 from ..volume import LineIntegrals, Volume
 from .flow import TimeBasis, path_positions
@@ -107,11 +107,6 @@ class SurfaceMesh:
         there = device(backend)
         return self._with(self.vertices.to(there), self.faces.to(there), backend)
 
-    @property
-    def stored_bytes(self) -> int:
-        """Size of vertices as float32 and faces as int32."""
-        return 4 * (self.vertices.numel() + self.faces.numel())
-
     def enclosing_grid(self, most_voxels: int) -> Grid:
         """A grid around all vertices, of `unit_length` a voxel, or coarser where those would be over `most_voxels`."""
         return Grid.around(self.vertices.detach().cpu().numpy(), self.unit_length, most_voxels)
@@ -158,7 +153,7 @@ class SurfaceMesh:
         """
         whole = self.mesh()
         labels = shell_labels(whole.faces, len(whole.vertices))
-        shells = [_compact(whole, whole.faces[labels == k], "shell") for k in range(labels.max() + 1)]
+        shells = [part_of(whole, whole.faces[labels == k], "shell") for k in range(labels.max() + 1)]
         shells.sort(key=lambda shell: -shell.volume)
         outer = [shell for shell in shells if shell.volume > 0]
         if not outer:
@@ -168,25 +163,13 @@ class SurfaceMesh:
             around = [round(winding_number(o.vertices[o.faces], cavity.vertices[0]), 3) for o in outer]
             smallest = max(range(len(outer)), key=lambda k: (around[k], k))  # outer ones are sorted by size
             members[smallest].append(cavity)
-        return [_joined(parts, f"body{k:03d}") for k, parts in enumerate(members)]
+        return [joined(parts, f"body{k:03d}") for k, parts in enumerate(members)]
 
 
 def _shares(enclosed: list[Tensor], dim: int) -> Tensor:
     """What is of each material, along a new axis `dim`, by what its surfaces enclose: it and all before it."""
     stronger = [torch.zeros_like(enclosed[0]), *enclosed[:-1]]
     return torch.stack([one - less for one, less in zip(enclosed, stronger)], dim=dim)
-
-
-def _compact(mesh: TriangleMesh, faces: np.ndarray, name: str) -> TriangleMesh:
-    """The part of `mesh` that `faces` need."""
-    used, index = np.unique(faces, return_inverse=True)
-    return TriangleMesh(mesh.vertices[used], index.reshape(-1, 3), name)
-
-
-def _joined(parts: list[TriangleMesh], name: str) -> TriangleMesh:
-    starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
-    faces = [part.faces + start for part, start in zip(parts, starts)]
-    return TriangleMesh(np.concatenate([part.vertices for part in parts]), np.concatenate(faces), name)
 
 
 class MovingSurfaces:
@@ -279,11 +262,6 @@ class MovingSurfaces:
         bodies = self.with_parameters({})
         bodies.backend = in_main_memory(backend)
         return bodies
-
-    @property
-    def stored_bytes(self) -> int:
-        """Size of coefficients as float32 and faces as int32."""
-        return 4 * (self.coefficients.numel() + self.faces.numel())
 
     def enclosing_grid(self, most_voxels: int) -> Grid:
         """A grid around all bodies at all times, as of `SurfaceMesh`: paths do not leave the hull of coefficients."""

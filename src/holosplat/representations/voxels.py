@@ -204,11 +204,6 @@ class VoxelGrid:
         """How large the grid is, in words."""
         return " × ".join(map(str, self.grid.shape)) + " voxels"
 
-    @property
-    def stored_bytes(self) -> int:
-        """Size of the values as float16."""
-        return 2 * self.values.numel()
-
     def on(self, backend: str) -> VoxelGrid:
         """The grid for another backend (resolved), on that backend's device; itself where it is that already."""
         if backend == self.backend:

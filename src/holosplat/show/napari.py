@@ -18,6 +18,7 @@ from ..io.hdf5 import open_hdf5
 from ..io.objects import FORMAT, read_object
 from ..io.objects import GAUSSIANS_FORMAT as GAUSSIANS
 from ..io.volumes import NAMES, read_volume
+from ..mesh import joined
 from ..representations import InMotion, Stored, SurfaceMesh
 from ..volume import Volume
 from ..workflows.reconstruction import instants_of
@@ -113,13 +114,8 @@ def _placed(grid: Grid, moving: bool) -> tuple[tuple[float, ...], tuple[float, .
 
 def _surface(name: str, moments: Sequence[Stored], moving: bool, about: dict[str, Any]) -> Layer:
     """Triangles, whose vertices begin with the number of the time where they move."""
-    vertices, faces, before = [], [], 0
-    for number, moment in enumerate(moments):
-        assert isinstance(moment, SurfaceMesh)
-        mesh = moment.mesh()
-        places = MICROMETRES * mesh.vertices[:, ::-1]
-        vertices.append(np.insert(places, 0, number, axis=1) if moving else places)
-        faces.append(mesh.faces + before)
-        before += len(places)
-    data = (np.concatenate(vertices), np.concatenate(faces))
+    meshes = [moment.mesh() for moment in moments if isinstance(moment, SurfaceMesh)]
+    whole, numbers = joined(meshes), np.repeat(np.arange(len(meshes)), [len(mesh.vertices) for mesh in meshes])
+    places = MICROMETRES * whole.vertices[:, ::-1]
+    data = (np.column_stack([numbers, places]) if moving else places, whole.faces)
     return data, {"name": name, "metadata": {"unit": "µm", **about}}, "surface"

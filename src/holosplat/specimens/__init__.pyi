@@ -25,7 +25,6 @@ from .fluids import Shock as Shock
 from .gas_waves import ExpandingShock as ExpandingShock
 from .membrane.model import Elasticity as Elasticity
 from .membrane.model import Membrane as Membrane
-from .membrane.model import stretch as stretch
 from .membrane.rest import resting_cell as resting_cell
 from .phantoms import Ball as Ball
 from .phantoms import Capsule as Capsule

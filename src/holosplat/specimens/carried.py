@@ -168,22 +168,18 @@ class Sink:
     def back(self, points: np.ndarray, time: float) -> np.ndarray:
         """See `Motion`."""
         lost = self._lost(time)
-        centre = np.asarray(self.centre)[:, None]
-        away = points - centre
-        cube = np.power((away * away).sum(0), 1.5)
-        shrunk = self.core**3 - lost
-        factor = np.where(cube >= shrunk, 1 + lost / np.maximum(cube, shrunk), self.core**3 / shrunk)
-        return centre + away * np.cbrt(factor)
+        return self._grown(points, lost, self.core**3 - lost)
 
     def forth(self, points: np.ndarray, time: float) -> np.ndarray:
         """See `Motion`."""
-        lost = self._lost(time)
+        return self._grown(points, -self._lost(time), self.core**3)
+
+    def _grown(self, points: np.ndarray, more: float, inner: float) -> np.ndarray:
+        """Points whose `r³` about the centre is by `more` larger, within `inner` in proportion."""
         centre = np.asarray(self.centre)[:, None]
         away = points - centre
         cube = np.power((away * away).sum(0), 1.5)
-        whole = self.core**3
-        factor = np.where(cube >= whole, 1 - lost / np.maximum(cube, whole), 1 - lost / whole)
-        return centre + away * np.cbrt(factor)
+        return centre + away * np.cbrt(1 + more / np.maximum(cube, inner))
 
 
 @dataclass(frozen=True)
@@ -216,15 +212,11 @@ class Sinks:
 
     def back(self, points: np.ndarray, time: float) -> np.ndarray:
         """See `Motion`."""
-        for sink in reversed(self.placed(time)):
-            points = sink.back(points, time)
-        return points
+        return Chain(tuple(self.placed(time))).back(points, time)
 
     def forth(self, points: np.ndarray, time: float) -> np.ndarray:
         """See `Motion`."""
-        for sink in self.placed(time):
-            points = sink.forth(points, time)
-        return points
+        return Chain(tuple(self.placed(time))).forth(points, time)
 
     def placed(self, time: float) -> list[Sink]:
         """The sinks about the points that they have at `time` [s]."""

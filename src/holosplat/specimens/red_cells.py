@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from ..checks import InputError, finite, in_range, require, shaped
-from ..mesh import TriangleMesh
+from ..mesh import TriangleMesh, normals
 from ..ranges import Stretch, ranged
 
 RADIUS = 3.91e-6
@@ -252,7 +252,7 @@ class _Placed:
         typical = deform if stretch is None else stretch
         cell = RedCell(diameter, stretch=typical * rng.standard_normal(), bend=bend)
         mesh = cell.mesh(FINE_LEVEL)
-        outer = mesh.vertices + margin * _vertex_normals(mesh)
+        outer = mesh.vertices + margin * normals(mesh)
         reach = float(np.linalg.norm(np.concatenate([mesh.vertices, outer]), axis=1).max())
         return cls(cell, mesh.vertices, outer, reach)
 
@@ -363,16 +363,6 @@ def _random_rotation(rng: np.random.Generator) -> np.ndarray:
     from scipy.spatial.transform import Rotation  # which takes long to load
 
     return Rotation.from_quat(rng.standard_normal(4)).as_matrix()
-
-
-def _vertex_normals(mesh: TriangleMesh) -> np.ndarray:
-    """Outward unit normals [P, 3], averaged over the triangles about each vertex by area."""
-    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
-    of_face = np.repeat(np.cross(b - a, c - a), 3, axis=0)
-    corner = mesh.faces.reshape(-1)
-    sums = [np.bincount(corner, weights=of_face[:, i], minlength=len(mesh.vertices)) for i in range(3)]
-    normals = np.stack(sums, axis=1)
-    return normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 
 def _check_channel(

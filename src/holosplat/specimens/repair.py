@@ -9,7 +9,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from ..checks import InputError
-from ..mesh import TriangleMesh, winding_number
+from ..mesh import TriangleMesh, part_of, vector_areas, winding_number
 from ..units import LENGTH_UNITS, unit_factor
 
 
@@ -31,14 +31,13 @@ def closed(mesh: TriangleMesh, length_unit: str = "um") -> TriangleMesh:
     _require_closed(merged, length_unit)
     faces, shells, was_consistent = _wound_consistently(merged)
     faces = _turned_outwards(merged, faces, shells, was_consistent)
-    used, faces = np.unique(faces, return_inverse=True)
-    return replace(merged, vertices=merged.vertices[used], faces=faces.reshape(-1, 3))
+    return part_of(merged, faces, merged.name)
 
 
 def _areas(mesh: TriangleMesh) -> np.ndarray:
     """Triangle areas [F] in m², exact zeros below the rounding of the coordinates."""
     a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
-    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    area = np.linalg.norm(vector_areas(mesh), axis=1)
     longest = np.sqrt(np.max([((b - a) ** 2).sum(1), ((c - b) ** 2).sum(1), ((a - c) ** 2).sum(1)], axis=0))
     return np.where(area > 1e-12 * longest**2, area, 0.0)
 

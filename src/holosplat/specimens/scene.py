@@ -13,7 +13,7 @@ from torch.nn.functional import grid_sample
 from ..checks import InputError, finite, require, shaped
 from ..geometry import Grid, Views
 from ..matter import DeltaBeta
-from ..mesh import TriangleMesh
+from ..mesh import TriangleMesh, joined
 from ..projectors.mesh import mesh_line_integrals, voxelise_meshes
 from ..projectors.voxels.raycast import voxel_line_integrals
 from ..volume import LineIntegrals, Volume
@@ -96,8 +96,7 @@ class MeshScene:
 
         The kinds are the (δ, β) of the materials, or units of δ and of β where there are more than two materials.
         """
-        offsets = np.cumsum([0] + [len(m.vertices) for m in self.meshes[:-1]])
-        faces = np.concatenate([m.faces + o for m, o in zip(self.meshes, offsets)])
+        whole = joined(self.meshes)
         matter = np.array([(m.delta, m.beta) for m in self.materials], dtype=np.float64)  # [M, 2]
         kinds = tuple(dict.fromkeys((float(delta), float(beta)) for delta, beta in matter))
         if len(kinds) > 2:
@@ -105,7 +104,7 @@ class MeshScene:
         else:
             values = np.stack([(matter == kind).all(1) for kind in kinds]).astype(np.float64)
         values = np.repeat(values, [len(m.faces) for m in self.meshes], axis=1)
-        return np.concatenate([m.vertices for m in self.meshes]), faces, values, kinds
+        return whole.vertices, whole.faces, values, kinds
 
 
 STEP = 0.25

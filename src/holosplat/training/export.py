@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 
@@ -43,7 +42,9 @@ def export(dataset: Dataset, layout: Format, on_progress: Advance = lambda fract
     dataset.require_whole()
     target = dataset.folder / layout
     require(not target.exists(), f"{target} is there already; remove it, or choose another --out.")
-    return WRITERS[layout](dataset, target, on_progress)
+    if layout == "onix":
+        return _onix(dataset, target, on_progress)
+    return _scenes_of(dataset, target, on_progress, layout)
 
 
 def _scenes_of(dataset: Dataset, target: Path, on_progress: Advance, layout: Format) -> Exported:
@@ -66,14 +67,6 @@ def _scenes_of(dataset: Dataset, target: Path, on_progress: Advance, layout: For
             f"{layout} has views about one axis, but no scene of {dataset.folder} has; draw some with --tilted 0.",
         )
     return Exported(target, dataset.count - len(left_out), tuple(left_out))
-
-
-def _nerf(dataset: Dataset, target: Path, on_progress: Advance) -> Exported:
-    return _scenes_of(dataset, target, on_progress, "nerf-synthetic")
-
-
-def _r2(dataset: Dataset, target: Path, on_progress: Advance) -> Exported:
-    return _scenes_of(dataset, target, on_progress, "r2-gaussian")
 
 
 def _onix(dataset: Dataset, target: Path, on_progress: Advance) -> Exported:
@@ -133,10 +126,3 @@ def _description(scene: SampleScan) -> dict[str, float]:
         "delta": scene.material.delta,
         "beta": scene.material.beta,
     }
-
-
-class _Writer(Protocol):
-    def __call__(self, dataset: Dataset, target: Path, on_progress: Advance) -> Exported: ...
-
-
-WRITERS: Mapping[Format, _Writer] = {"nerf-synthetic": _nerf, "r2-gaussian": _r2, "onix": _onix}

@@ -1,31 +1,39 @@
 """Errors of a reconstruction's numbers, factors of their intervals, the probability that a voxel is matter, and
-reconstructions like one that was made."""
+reconstructions like one that was made, by which mistakes in the metadata of a scan are compared on held-out frames."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
-from ..checks import require, shaped
-from ..geometry import Grid
-from ..matter import MaterialPrior
-from ..methods import Method
+from ..align import find_axis
+from ..checks import InputError, require, shaped
+from ..geometry import Grid, rotation_y
+from ..inference import Decision, Score, select
+from ..matter import DeltaBeta, MaterialPrior
+from ..methods import Method, Uncertain
+from ..methods.cross_validation import predicted_frames
 from ..methods.illumination import CORRELATED, STAGE
 from ..metrics import robust_material_delta, volume_scores
 from ..metrics.volumes import require_same_grid
 from ..optics.background import LightOptions
-from ..scan import Scan
-from ..tables import read_table
+from ..progress import Progress
+from ..rotations import angles_about_y
+from ..scan import Scan, interleaved_split
+from ..tables import overridden, read_table
 from ..volume import Volume
 from .evaluate import of_absorption
+from .next_step import STIFF
 from .reconstruct import reconstruct
 from .reconstruction import Reconstruction
+from .run_illumination import light_of
 
 FACTORS = Path(__file__).with_name("conformal.toml")
 """Factors of stated errors, with the scenes that they are of: benchmarks/calibrate_intervals.py."""
@@ -122,6 +130,120 @@ class Again:
         light = light if done.still is None else LightOptions()  # which finds the fixed pattern, too
         how = {"prior": self.prior, "method": self.method, "light": light, "matter": done.choice.matter}
         return reconstruct(scan, seed=self.seed + further, **(how | changed))
+
+
+NULL = "metadata as given"
+"""The candidate that leaves scan and prior alone."""
+NAME, BY = "mistake in the metadata", "held-out frames"
+FEWEST = 4
+"""Frames of which one can be held out."""
+RANGE = 3.0
+"""Factor by which a distance or δ/β may be larger or smaller than given."""
+
+
+Change = Callable[[Scan, Again], tuple[Scan, Mapping[str, Any]]]
+"""A scan and what is changed of its reconstruction, as `Again` takes it by name, if a mistake is put right."""
+
+
+def _other_sign(scan: Scan, again: Again) -> tuple[Scan, Mapping[str, Any]]:
+    prior = again.prior
+    flipped = [DeltaBeta(-delta, -beta) for delta, beta in prior.materials]
+    return scan, {
+        "prior": MaterialPrior.known(*flipped) if flipped else prior.signed(-1 if prior.delta_sign > 0 else 1)
+    }
+
+
+def _axis(scan: Scan, again: Again) -> tuple[Scan, Mapping[str, Any]]:
+    return replace(scan, exposures=find_axis(scan.train()).applied(scan.exposures)), {}
+
+
+def _turned(angles: Callable[[np.ndarray], np.ndarray]) -> Change:
+    """Other angles [rad] than those of the scan."""
+
+    def change(scan: Scan, again: Again) -> tuple[Scan, Mapping[str, Any]]:
+        views = scan.views
+        if not views.shares_axis:
+            raise InputError("views without a common axis have no angles.")
+        rotations = rotation_y(np.rad2deg(angles(np.unwrap(angles_about_y(views.rotations)))))
+        return replace(scan, exposures=replace(scan.exposures, views=replace(views, rotations=rotations))), {}
+
+    return change
+
+
+def _spread(scan: Scan, again: Again) -> tuple[Scan, Mapping[str, Any]]:
+    return scan, {"uncertain": Uncertain(distance=_about(float(np.median(scan.exposures.distance))))}
+
+
+def _ratio(scan: Scan, again: Again) -> tuple[Scan, Mapping[str, Any]]:
+    prior = again.prior
+    ratio = prior.materials[0].ratio if prior.materials else getattr(prior, "ratio", 0.0)
+    if not ratio or len(prior.materials) > 1:
+        raise InputError("there is no one known ratio δ/β.")
+    return scan, {"prior": MaterialPrior.unknown(prior.sign), "uncertain": Uncertain(delta_beta=_about(abs(ratio)))}
+
+
+def _about(value: float) -> tuple[float, float]:
+    return value / RANGE, value * RANGE
+
+
+def _beyond(scan: Scan, again: Again) -> tuple[Scan, Mapping[str, Any]]:
+    return scan, {"method": overridden(again.method, ["volume.beside=0.5"])}
+
+
+def _steps(turn: float) -> Change:
+    return _turned(lambda angles: np.arange(len(angles)) * turn / len(angles))
+
+
+MISTAKES: Mapping[str, tuple[str, Change]] = {
+    "axis of rotation": ("shift_x", _axis),
+    "other sign of δ": ("sign", _other_sign),
+    "angles in reverse order": ("angles", _turned(lambda angles: angles[::-1])),
+    "angles in radians": ("angles", _turned(lambda angles: np.rad2deg(angles))),
+    "twice the angles": ("angles", _turned(lambda angles: 2 * angles)),
+    "half the angles": ("angles", _turned(lambda angles: 0.5 * angles)),
+    "equal steps over 180°": ("angles", _steps(np.pi)),
+    "equal steps over 360°": ("angles", _steps(2 * np.pi)),
+    "uneven light": ("light", lambda scan, again: (scan, {"light": LightOptions("smooth")})),
+    "distance": ("distance", _spread),
+    "δ/β": ("absorption", _ratio),
+    "continuous matter": (STIFF, lambda scan, again: (scan, {"matter": "continuous"})),
+    "matter beyond the field": ("beyond", _beyond),
+}
+"""Mistakes from simple to complex: each with the key of `STEPS`, and what puts it right."""
+
+
+def compare_causes(scan: Scan, again: Again, on_progress: Progress = lambda stage, fraction: None) -> Decision:
+    """Which of `MISTAKES`, put right, predicts held-out frames better than the metadata as given, the null.
+
+    Without held-out frames, every fourth one is held out. Another sense of rotation is none of the mistakes: the
+    mirrored object gives the same frames. The choice is a key of `STEPS`, or the null.
+    """
+    if len(scan) < FEWEST:
+        return Decision(NAME, NULL, f"fewer than {FEWEST} frames, of which none can be held out")
+    scan = scan if scan.is_test.any() else replace(scan, is_test=interleaved_split(len(scan)))
+    keys = {name: key for name, (key, _) in MISTAKES.items()} | {NULL: NULL}
+    order = list(MISTAKES)
+
+    @cache
+    def score(name: str) -> Score:
+        changed, how = (scan, {}) if name == NULL else MISTAKES[name][1](scan, again)
+        found = again(changed, **how)
+        placed = found.placed(changed)
+        lit, test = light_of(placed, found.light, found.still), placed.test()
+        predicted = predicted_frames(test.exposures, found.object, found.oversample)
+        lamp = 1.0 if lit is None else lit.factor()[torch.from_numpy(scan.is_test)].to(predicted)
+        return Score.of(test.left(predicted * lamp))
+
+    possible = [NULL]
+    for number, name in enumerate(order):
+        on_progress(f"cause: {name}", number / len(order))
+        try:
+            score(name)
+        except InputError:  # this mistake cannot have been made here
+            continue
+        possible.append(name)
+    decision = select(NAME, possible, lambda name, fold: score(name), by=BY)
+    return replace(decision, choice=keys[decision.choice])
 
 
 BINS = np.linspace(-0.5, 1.5, 41)

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from ..checks import require
-from ..frames import Derived, Taken
+from ..frames import Derived, Taken, evenly
 from ..io.atomic import require_apart, require_writable
 from ..io.formats import loader_of, open_raw
 from ..io.nxtomo import scan_writer
@@ -233,7 +233,7 @@ def correct(
         lacks = reading.applied(Scan.of(everywhere, file.exposures, file.is_test, {}), joined=False)[[0]].missing
         kept = {"light": scan.light, "mask": None if lacks is None else lacks[0]}
         with scan_writer(out, scan.exposures, scan.is_test, scan.provenance, **kept) as add:
-            shown = set(np.linspace(0, len(scan) - 1, LOOKED_AT).round().astype(int).tolist())
+            shown = evenly(len(scan), LOOKED_AT)
             written = []
             for i in range(len(scan)):
                 one = scan[[i]]

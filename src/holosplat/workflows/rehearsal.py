@@ -30,19 +30,21 @@ from ..volume import Object, Volume
 from .certainty import (
     LEVEL,
     MATTER,
+    NULL,
     SIGNED,
     SIZES,
     VOXELS,
     Again,
     MatterMap,
     centre_and_scale,
+    compare_causes,
     errors_of,
     factors,
     matter_probabilities,
     occupancy_counts,
 )
 from .evaluate import of_absorption
-from .next_step import NULL, compare_causes, next_step
+from .next_step import next_step
 from .reconstruct import reconstruct
 from .reconstruction import Reconstruction
 from .run_folder import RunFolder
@@ -252,7 +254,7 @@ def rehearse(
     done: a run of one time; scan: its frames, as `done.placed` gives them; prior, method, seed: of the run
     bins: pixels joined along an edge (default: to about `SIDE` pixels); of joined pixels the measured frames are
     reconstructed, too
-    causes: whether mistakes in the scan are compared on held-out frames (`next_step`) if the residual is more than the
+    causes: whether mistakes in the scan are compared on held-out frames (`certainty`) if the residual is more than the
     rehearsals leave
     folder: of the run, whose summary.json keeps each rehearsal, so that a later call makes those that are missing
 

@@ -15,6 +15,7 @@ import torch
 from ..baselines import HolographicTV
 from ..checks import InputError, require
 from ..divided_light import DividedLight
+from ..frames import block_means
 from ..inference import ERRORS
 from ..matter import MaterialPrior
 from ..methods import Method, Task
@@ -162,7 +163,7 @@ class Look:
         """At `count` relative frames [H, W], `frame(i)` one at a time."""
         first = frame(0)
         factor = min(math.ceil(max(first.shape) / LONGEST), *first.shape)
-        binned = np.stack([_binned(first if i == 0 else frame(i), factor) for i in range(count)])
+        binned = np.stack([block_means(first if i == 0 else frame(i), factor) for i in range(count)])
         return cls(binned, factor, (first.shape[0], first.shape[1]))
 
     def air(self) -> float | None:
@@ -226,11 +227,6 @@ class AirLight:
         """The light [H, W] of projection `number`."""
         rows, columns = (cosines(n, ORDER, "cpu").numpy() for n in shape)
         return np.exp(rows.T @ self.coefficients[number].reshape(ORDER + 1, ORDER + 1) @ columns)
-
-
-def _binned(frame: np.ndarray, factor: int) -> np.ndarray:
-    h, w = (n // factor * factor for n in frame.shape)
-    return frame[:h, :w].reshape(h // factor, factor, w // factor, factor).mean(axis=(1, 3))
 
 
 def _shrunk(box: Box, factor: int, shape: tuple[int, ...]) -> Box:

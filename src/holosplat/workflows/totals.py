@@ -12,6 +12,7 @@ import torch
 
 from ..checks import InputError
 from ..fit.residuals import Prediction
+from ..frames import evenly
 from ..geometry import Grid
 from ..methods import Task
 from ..methods.modulation import DOUBTFUL, RATIO_SHARE, Total, total_delta
@@ -95,7 +96,7 @@ def total_of_run(said: Prediction, frames: Scan, task: Task, constants: tuple[De
         return TotalMatter(quantity, None, None, held, words)
     if sign * held <= 0:
         return TotalMatter(quantity, None, None, held, f"total {quantity}: none, for the volume is empty")
-    chosen = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), MOST_VIEWS)).round().astype(int))
+    chosen = evenly(len(frames), MOST_VIEWS)
     factor = binning(frames, MOST_VOXELS)
     few = frames[chosen]
     predicted = None if _imaged_as_voxels(said, frames, factor) else _predicted(said, few, chosen).binned(factor)

@@ -15,6 +15,7 @@ from ..checks import InputError
 from ..fit.misfit_diagnosis import Cause, cause_scores, likely_causes
 from ..fit.residuals import Prediction, Residuals, residuals, split_validation
 from ..fit.run import Running
+from ..frames import evenly
 from ..methods import Task
 from ..model import LightField, Model, SolvedLight
 from ..optics.noise import NoiseModel, noise_levels
@@ -142,7 +143,7 @@ def judge(said: Prediction, frames: Scan, noise: NoiseModel | None = None) -> Ve
 def _matter(said: Prediction) -> tuple[torch.Tensor, torch.Tensor]:
     """Sizes of the integrals of β and δ through the object [v, H, W] in a few views."""
     views = said.exposures.views
-    few = np.unique(np.linspace(0, len(views) - 1, min(len(views), FEW_VIEWS)).round().astype(int))
+    few = evenly(len(views), FEW_VIEWS)
     with torch.no_grad():
         beta, delta = said.object.project(views[few])
     return beta.abs().cpu(), delta.abs().cpu()

@@ -111,7 +111,8 @@ def run(
         retry: Run again what failed.
         list_only: Only list cases and methods.
     """
-    from holosplat.beamline.declared.declaration import Case
+    from holosplat.beamline.declaration import Case
+
     from holosplat.io.lock import sole_writer
 
     from ..suite.case import case_names, load_case

@@ -7,10 +7,12 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+from holosplat.beamline.declaration import Case, case_of
 
-from holosplat.beamline.declared.declaration import Case, case_of, declared_names, read_declaration
 from holosplat.checks import InputError, require, whole_seed
 from holosplat.scan import Exposures
+
+from .declared import declared_names, read_declaration
 
 FOLDER = Path(__file__).with_name("cases")
 """The suite: a TOML file for each case, or for several that differ little."""

@@ -9,22 +9,6 @@ from functools import partial
 
 import numpy as np
 
-from holosplat.beamline.declared.specimens import (
-    BallStar,
-    BodyWithAbsorber,
-    Capsules,
-    CoatedDroplets,
-    Continuous,
-    CrowdedCells,
-    FoamDrop,
-    Meshed,
-    RedCells,
-    RoundCell,
-    SheppLogan,
-    SoftCells,
-    Specimen,
-    Tissue,
-)
 from holosplat.beamline.light import UnevenLight
 from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
@@ -33,10 +17,21 @@ from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.metrics import volume_scores
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.continuous import Bump, ContinuousScene, Element, Soft, ellipsoid
+from holosplat.specimens.matter import (
+    Capsules,
+    ContinuousKind,
+    CrowdedCells,
+    FoamDrop,
+    MeshedKind,
+    RedCells,
+    SoftCells,
+)
 from holosplat.specimens.phantoms import packed_balls
 from holosplat.specimens.scene import MeshScene
 from holosplat.units import wavelength, wavenumber
 from holosplat.workflows.reconstruct import Reconstruction
+
+from .declared import BallStar, BodyWithAbsorber, CoatedDroplets, RoundCell, SheppLogan, Specimen, Tissue
 
 
 @dataclass(frozen=True)
@@ -238,9 +233,9 @@ def _filled(
     filling: Callable[[DeltaBeta], DeltaBeta] | None,
     material: DeltaBeta,
 ) -> MeshScene | ContinuousScene:
-    if isinstance(specimen, Continuous):
+    if isinstance(specimen, ContinuousKind):
         return specimen.continuous(seed, [material, *([filling(material)] if filling else [])])[0]
-    assert isinstance(specimen, Meshed)
+    assert isinstance(specimen, MeshedKind)
     made = specimen.bodies(seed, None)
     empty = DeltaBeta(-material.delta, -material.beta)
     materials = [material] * len(made.outer) + [empty] * len(made.cores)

@@ -16,7 +16,7 @@ from holosplat.align.derivatives import blurred, in_pixels, projections
 from holosplat.align.find import align_views
 from holosplat.align.initial_geometry import shifts_by_mass
 from holosplat.baselines import TOMOGRAPHIES
-from holosplat.beamline.declared.declaration import Case
+from holosplat.beamline.declaration import Case
 from holosplat.checks import require
 from holosplat.geometry import Grid, Views
 from holosplat.matter import Known, MaterialPrior, Matter
@@ -35,7 +35,6 @@ from holosplat.methods import (
 )
 from holosplat.methods import Method as Options
 from holosplat.methods.ground import assumed_material
-from holosplat.methods.per_view import SVMBIR
 from holosplat.methods.presets import preset
 from holosplat.optics.retrieval import tikhonov
 from holosplat.planning.acts import of_simulation
@@ -46,6 +45,7 @@ from holosplat.scan import Exposures, Scan
 from holosplat.volume import Object, Volume
 from holosplat.workflows.reconstruct import reconstruct
 
+from ..opponents.mbir import SVMBIR
 from ..opponents.photographs import AlphaSplats, RadianceFields
 from .prepare import MeasuredCase
 

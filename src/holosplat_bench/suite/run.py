@@ -9,21 +9,28 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Protocol, cast, runtime_checkable
+from typing import cast
 
 import numpy as np
+from holosplat.beamline.declaration import Case
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
 
 from holosplat.align.held_out import place_frames
 from holosplat.align.poses import PoseOptions
 from holosplat.backends import resolve
-from holosplat.beamline.declared.declaration import Case
 from holosplat.checks import InputError, require
 from holosplat.metrics import resolution
 from holosplat.optics.sampling import fringe_sampling
 from holosplat.progress import Progress
-from holosplat.representations import Stored
+from holosplat.representations import (
+    MovingSurfaces,
+    NeuralField,
+    PixelAlignedField,
+    Stored,
+    SurfaceMesh,
+    VoxelGrid,
+)
 from holosplat.scan import Scan
 from holosplat.specimens.phantoms import Ball
 from holosplat.specimens.scene import MeshScene
@@ -238,10 +245,17 @@ class _Job:
     aligner: Aligner | None = None
 
 
-@runtime_checkable
-class _Stored(Protocol):
-    @property
-    def stored_bytes(self) -> int: ...
+def stored_bytes(found: Stored) -> int:
+    """Size of what has to be stored of an object: voxels, networks and their images as float16, and the mask of fields
+    in bits; all other parameters as float32, and faces as int32."""
+    count = sum(parameter.numel() for parameter in found.parameters().values())
+    if isinstance(found, VoxelGrid):
+        return 2 * count
+    if isinstance(found, NeuralField | PixelAlignedField):
+        images = found.images.numel() if isinstance(found, PixelAlignedField) else 0
+        return 2 * (count + images) + found.mask.numel() // 8
+    faces = found.faces.numel() if isinstance(found, SurfaceMesh | MovingSurfaces) else 0
+    return 4 * (count + faces)
 
 
 @dataclass(frozen=True)
@@ -281,7 +295,7 @@ class _Bench:
                 row = replace(row, seconds=time.perf_counter() - began, memory_bytes=growth())
             self.on_progress(stage + "scores", 0.0)
             scores, picture = self._judged(found, stage)
-            size = found.stored_bytes if isinstance(found, _Stored) else None
+            size = stored_bytes(found) if isinstance(found, Stored) else None
             row = replace(row, status="done", stored_bytes=size, **_numbers(scores))
             if isinstance(self.case, MeasuredCase):
                 row.volume.update(agreement(found.voxelise(self.truth.grid), self.truth))

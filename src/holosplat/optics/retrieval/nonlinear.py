@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -36,18 +37,43 @@ class Tikhonov(Regularised):
     """Weight of the penalty; 1 is the Bayesian weight for Gaussian matter."""
 
 
-@or_in_contact
-def tikhonov(
-    frames: Tensor,
-    exposures: Exposures,
-    delta: float,
-    beta: float,
-    *,
-    options: Tikhonov = Tikhonov(),
-    missing: Tensor | None = None,
-    two_sided: bool = False,
-    on_progress: Advance = lambda fraction: None,
-) -> Tensor:
+@checked_dataclass
+class ADMM(Regularised):
+    """Options. iterations: updates of the multipliers; weight: of total variation, relative to the mean slope of the
+    estimate."""
+
+
+Options = TypeVar("Options", Tikhonov, ADMM, Projections)
+
+
+def through_waves(usual: Options) -> Callable[[Callable[[Options, WaveModel, Advance], Tensor]], Callable[..., Tensor]]:
+    """Make a `Retrieval`, whose `options` are by default as `usual`, of a function that finds the bounded phases
+    [V, H, W] of views that are alike, by options, model and progress."""
+
+    def made(solve: Callable[[Options, WaveModel, Advance], Tensor]) -> Callable[..., Tensor]:
+        def method(
+            frames: Tensor,
+            exposures: Exposures,
+            delta: float,
+            beta: float,
+            *,
+            options: Options = usual,
+            missing: Tensor | None = None,
+            two_sided: bool = False,
+            on_progress: Advance = lambda fraction: None,
+        ) -> Tensor:
+            told = (missing, two_sided, on_progress)
+            return view_by_view(frames, exposures, (delta, beta), options, partial(solve, options), told)
+
+        method.__name__ = method.__qualname__ = solve.__name__
+        method.__doc__ = solve.__doc__
+        return or_in_contact(method)
+
+    return made
+
+
+@through_waves(Tikhonov())
+def tikhonov(options: Tikhonov, model: WaveModel, on_progress: Advance) -> Tensor:
     """Thickness [V, H, W] in metres of one material, β of any sign, that agrees with frames [V, H, W].
 
     It minimises `½ Σ (√I(φ) - √I)² + ½ Σ R |F[φ]|²` over phases φ = k|δ|T that are not negative (unless `two_sided`)
@@ -57,11 +83,7 @@ def tikhonov(
     the others', change too. The iteration starts from `bounded_estimate` and keeps its support. A step that would not
     lower the objective is refused, and its view is damped more.
     """
-
-    def solve(model: WaveModel, on_progress: Advance) -> Tensor:
-        return descend(model, options, on_progress)[0]
-
-    return view_by_view(frames, exposures, (delta, beta), options, solve, (missing, two_sided, on_progress))
+    return descend(model, options, on_progress)[0]
 
 
 def penalty_weights(model: WaveModel, weight: float) -> Tensor:
@@ -115,24 +137,8 @@ COUPLING = 0.05
 """Penalty of leaving the bounds, in the curvature of the strongest frequency."""
 
 
-@checked_dataclass
-class ADMM(Regularised):
-    """Options. iterations: updates of the multipliers; weight: of total variation, relative to the mean slope of the
-    estimate."""
-
-
-@or_in_contact
-def admm(
-    frames: Tensor,
-    exposures: Exposures,
-    delta: float,
-    beta: float,
-    *,
-    options: ADMM = ADMM(),
-    missing: Tensor | None = None,
-    two_sided: bool = False,
-    on_progress: Advance = lambda fraction: None,
-) -> Tensor:
+@through_waves(ADMM())
+def admm(options: ADMM, model: WaveModel, on_progress: Advance) -> Tensor:
     """Thickness [V, H, W] in metres of one material, β of any sign, with edges: frames [V, H, W] through full waves.
 
     `½ Σ (√I(φ) - √I)² + w TV(φ)` over phases φ = k|δ|T that are not negative (unless `two_sided`) and lie within a
@@ -142,13 +148,6 @@ def admm(
     the phase of a wave of its own may wrap. Villanueva-Perez et al. (2017) split the linear model; this is theirs, with
     the wave optics in its place and total variation beside the bounds.
     """
-
-    solve = partial(_alternating_directions, options)
-    return view_by_view(frames, exposures, (delta, beta), options, solve, (missing, two_sided, on_progress))
-
-
-def _alternating_directions(options: ADMM, model: WaveModel, on_progress: Advance) -> Tensor:
-    """The bounded phase [V, H, W] after all iterations."""
     phase = model.phase
     weight, edge = _weights(model, options)
     pull_slopes, pull_copy = weight / edge, COUPLING * model.strongest / model.oversample**2
@@ -220,18 +219,8 @@ def _laplacian(shape: tuple[int, int]) -> Tensor:
     return rows[:, None] + columns
 
 
-@or_in_contact
-def gerchberg_saxton(
-    frames: Tensor,
-    exposures: Exposures,
-    delta: float,
-    beta: float,
-    *,
-    options: Projections = Projections(),
-    missing: Tensor | None = None,
-    two_sided: bool = False,
-    on_progress: Advance = lambda fraction: None,
-) -> Tensor:
+@through_waves(Projections())
+def gerchberg_saxton(options: Projections, model: WaveModel, on_progress: Advance) -> Tensor:
     """Thickness [V, H, W] in metres of one material, β of any sign, by alternating projections.
 
     Gerchberg & Saxton (1972), or Fienup's (1982) error reduction: the wave in the detector plane takes the measured
@@ -239,25 +228,14 @@ def gerchberg_saxton(
     support of `bounded_estimate`, from which it starts. Frequencies around the zeros of the response stay as they were.
     """
 
-    def reduce(_: Tensor, projected: Tensor, model: WaveModel) -> Tensor:
+    def reduce(_: Tensor, projected: Tensor) -> Tensor:
         return model.bounded(projected)
 
-    solve = partial(_alternate, options, reduce)
-    return view_by_view(frames, exposures, (delta, beta), options, solve, (missing, two_sided, on_progress))
+    return _alternate(options, reduce, model, on_progress)
 
 
-@or_in_contact
-def hybrid_input_output(
-    frames: Tensor,
-    exposures: Exposures,
-    delta: float,
-    beta: float,
-    *,
-    options: Projections = Projections(),
-    missing: Tensor | None = None,
-    two_sided: bool = False,
-    on_progress: Advance = lambda fraction: None,
-) -> Tensor:
+@through_waves(Projections())
+def hybrid_input_output(options: Projections, model: WaveModel, on_progress: Advance) -> Tensor:
     """Thickness [V, H, W] in metres of one material, β of any sign, by Fienup's (1982) hybrid input–output.
 
     As `gerchberg_saxton`, but where the phase φ' after the detector's projection is negative (unless `two_sided`) or
@@ -265,16 +243,15 @@ def hybrid_input_output(
     iterate is bounded.
     """
 
-    def push(before: Tensor, projected: Tensor, model: WaveModel) -> Tensor:
+    def push(before: Tensor, projected: Tensor) -> Tensor:
         allowed = (projected >= model.least) & (model.support > 0)
         return torch.where(allowed, projected, before - options.feedback * projected)
 
-    solve = partial(_alternate, options, push)
-    return view_by_view(frames, exposures, (delta, beta), options, solve, (missing, two_sided, on_progress))
+    return _alternate(options, push, model, on_progress)
 
 
-Rule = Callable[[Tensor, Tensor, WaveModel], Tensor]
-"""(phase before, phase after the detector's projection, model) → the next phase."""
+Rule = Callable[[Tensor, Tensor], Tensor]
+"""(phase before, phase after the detector's projection) → the next phase."""
 
 
 def _alternate(options: Projections, rule: Rule, model: WaveModel, on_progress: Advance) -> Tensor:
@@ -282,7 +259,7 @@ def _alternate(options: Projections, rule: Rule, model: WaveModel, on_progress: 
     phase = model.phase
     for done in range(options.iterations):
         on_progress(done / options.iterations)
-        phase = rule(phase, through_detector(model, phase), model)
+        phase = rule(phase, through_detector(model, phase))
     return model.bounded(phase)
 
 

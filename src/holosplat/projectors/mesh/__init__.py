@@ -13,8 +13,7 @@ from ...backends import device
 from ...checks import require, shaped
 from ...geometry import Grid, Views
 from .. import obliquity
-from . import on_device
-from .reference import mean_depths, occupancy
+from .rays import mean_depths, occupancy
 
 __all__ = ["mesh_line_integrals", "voxelise_meshes"]
 
@@ -28,40 +27,21 @@ def mesh_line_integrals(
     inside the closed surface that each face belongs to. A pixel is the mean over `rays × rays` rays through it.
     Overlapping bodies add up. Along a ray the depth inside a closed surface is `Σ sign(n·z) z_hit` over the faces it
     crosses. In cones points go to `(x, y, z) / (1 + z / R)`, which keeps planes planes and makes rays parallel, and
-    depths come back at the hits. backend: resolved; numpy computes for all but `cuda`, for which torch does, on the
-    GPU.
+    depths come back at the hits. backend: resolved; on its device plain torch computes.
     """
     _check(vertices, faces, face_values, rays)
-    if backend == "cuda":
-        return _on_gpu(vertices, faces, face_values, views, rays)
-    out = np.empty((len(views), len(face_values), *views.shape))
-    for v in range(len(views)):
-        lab, bent = vertices @ views.rotations[v].T, _bent(views, v)
-        lab /= 1 + bent * lab[:, 2:]
-        lab[:, :2] -= views.shifts[v]
-        out[v] = mean_depths(lab, faces, face_values, views.shape, float(views.pixel_sizes[v]), rays, bent)
-        if bent:
-            out[v] *= _obliquity(views, v).numpy()
-    return torch.from_numpy(out)
-
-
-def _on_gpu(vertices: np.ndarray, faces: np.ndarray, face_values: np.ndarray, views: Views, rays: int) -> Tensor:
-    where = device("cuda")
-    points, corners, values = (torch.from_numpy(a).to(where) for a in (vertices, faces, face_values))
+    where = device(backend)
+    corners, values = _on(where, faces, face_values)
     out = values.new_empty(len(views), len(values), *views.shape)
     for v, pixel in enumerate(views.pixel_sizes.tolist()):
-        lab, bent = points @ torch.from_numpy(views.rotations[v].T.copy()).to(where), _bent(views, v)
-        lab = lab / (1 + bent * lab[:, 2:])
-        lab[:, :2] -= torch.from_numpy(views.shifts[v].copy()).to(where)
-        out[v] = on_device.mean_depths(lab, corners, values, views.shape, pixel, rays, bent)
+        bent = 0.0 if views.sources is None else 1 / float(views.sources[v])
+        lab = vertices @ views.rotations[v].T
+        lab /= 1 + bent * lab[:, 2:]
+        lab[:, :2] -= views.shifts[v]
+        out[v] = mean_depths(torch.from_numpy(lab).to(where), corners, values, views.shape, pixel, rays, bent)
         if bent:
             out[v] *= _obliquity(views, v).to(where)
     return out
-
-
-def _bent(views: Views, v: int) -> float:
-    """One over the distance [m] of a view's source; 0 for parallel rays."""
-    return 0.0 if views.sources is None else 1 / float(views.sources[v])
 
 
 def _obliquity(views: Views, v: int) -> Tensor:
@@ -74,7 +54,15 @@ def voxelise_meshes(
 ) -> np.ndarray:
     """Values [C, Z, Y, X] float64 of closed meshes, averaged over voxels: exact along z, `rays × rays` across."""
     _check(vertices, faces, face_values, rays)
-    return occupancy(vertices, faces, face_values, grid, rays)
+    return occupancy(torch.tensor(vertices), *_on(torch.device("cpu"), faces, face_values), grid, rays).numpy()
+
+
+def _on(where: torch.device, faces: np.ndarray, values: np.ndarray) -> tuple[Tensor, Tensor]:
+    """Copies of faces and of their values, int64 and float64."""
+    return (
+        torch.tensor(faces, dtype=torch.int64, device=where),
+        torch.tensor(values, dtype=torch.float64, device=where),
+    )
 
 
 def _check(vertices: np.ndarray, faces: np.ndarray, face_values: np.ndarray, rays: int) -> None:

@@ -84,11 +84,6 @@ class OnVoxels:
         found.backend = in_main_memory(backend)
         return found
 
-    @property
-    def stored_bytes(self) -> int:
-        """Size of the parameters as a run folder stores them, float32."""
-        return 4 * sum(p.numel() for p in self.parameters().values())
-
     def enclosing_grid(self, most_voxels: int) -> Grid:
         """The grid itself, whatever its size."""
         return self.grid

@@ -128,16 +128,16 @@ def svmbir_volume(question: Question) -> Callable[[], Answer]:
     import torch
 
     from holosplat.geometry import Grid
-    from holosplat.methods.per_view import Mbir
-    from holosplat.methods.per_view import svmbir_volume as reconstructed
 
+    from ...opponents.mbir import Mbir
+    from ...opponents.mbir import svmbir_volume as reconstructed
     from .own import views_of
 
     views, options = views_of(question), Mbir(threads=1)
     lines = torch.from_numpy(question.lines).float() * question.pixel
 
     def run() -> Answer:
-        volume = reconstructed(lines, views, Grid.of_views(views), lambda fraction: None, options=options)
+        volume = reconstructed(lines, views, Grid.of_views(views), None, lambda fraction: None, options=options)
         return {"volume": volume.numpy()}
 
     return run

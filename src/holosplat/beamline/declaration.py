@@ -1,34 +1,42 @@
-"""A case as its TOML file declares it: what is measured, of what, how, and the information for methods.
+"""A simulated experiment as it is declared: what is measured, of what, how, and the information for methods.
 
-A file is one case, or, with tables `[variants.NAME]`, as many cases that say what differs. `[with_snapshots]` says what
-differs where a folder of simulated cells is given. Lengths are in metres, angles in degrees, densities in g/cm³.
+Lengths are in metres, angles in degrees, densities in g/cm³. Training draws what is declared here; the benchmark has
+files of it, and further kinds.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal, Protocol
 
 import numpy as np
 
-from ...checks import InputError, in_range, require, shaped, whole_seed
-from ...geometry import Grid, Views, rotation_tilted, rotation_y
-from ...materials import DeltaBeta, parse_material
-from ...matter import MaterialPrior
-from ...optics.noise import PHOTON_RANGE
-from ...optics.propagation import poisson
-from ...ranges import Grams, Many, ManyOrNone, Metres, Photons, Pixels, Positive, Signed, Small, checked_dataclass
-from ...scan import Exposures, Scan, interleaved_split
-from ...specimens.drawn import Scene, Substances
-from ...specimens.phantoms import Ball
-from ...specimens.scene import MeshScene
-from ...tables import from_table, merged, read_table
-from ...volume import Volume
-from ..light import EVEN_LIGHT, UnevenLight
-from ..misalignment import AS_PLANNED, Misalignment
-from ..simulate import simulate
-from .specimens import Continuous, Meshed, Specimen
+from ..checks import in_range, require, shaped, whole_seed
+from ..geometry import Grid, Views, rotation_tilted
+from ..materials import DeltaBeta, parse_material
+from ..matter import MaterialPrior
+from ..optics.noise import PHOTON_RANGE
+from ..optics.propagation import poisson
+from ..ranges import (
+    Grams,
+    Metres,
+    Photons,
+    Pixels,
+    Positive,
+    Signed,
+    Small,
+    checked_dataclass,
+)
+from ..scan import Exposures, Scan
+from ..specimens.drawn import Scene, SpecimenKind
+from ..specimens.matter import ContinuousKind, MeshedKind
+from ..specimens.phantoms import Ball
+from ..specimens.scene import MeshScene
+from ..volume import Volume
+from .light import EVEN_LIGHT, UnevenLight
+from .misalignment import AS_PLANNED, Misalignment
+from .simulate import simulate
 
 MOST_PIXELS = 4096
 
@@ -96,42 +104,12 @@ class Detector:
             require(1 <= count <= MOST_PIXELS, f"{name} must lie between 1 and {MOST_PIXELS}, but it is {count}.")
 
 
-@checked_dataclass
-class Interleaved:
-    """`count` views evenly over 180° about the y axis, the last of every `hold_out_every` held out."""
-
-    kind: ClassVar[str] = "interleaved"
-    count: Many
-    hold_out_every: Many = 4
-
-    def __post_init__(self) -> None:
-        enough = 2 <= self.hold_out_every <= self.count
-        require(enough, f"hold_out_every must lie between 2 and count, {self.count}, but it is {self.hold_out_every}.")
+class Directions(Protocol):
+    """Views of an experiment."""
 
     def poses(self) -> tuple[np.ndarray, np.ndarray]:
         """Rotations [V, 3, 3], and which of them are held out [V] bool."""
-        angles = np.arange(self.count) * (180 / self.count)
-        return rotation_y(angles), interleaved_split(self.count, self.hold_out_every)
-
-
-@checked_dataclass
-class Between:
-    """`train` views evenly over 180° about the y axis, and `test` held-out ones, each in the middle of a gap."""
-
-    kind: ClassVar[str] = "between"
-    train: Many
-    test: ManyOrNone
-
-    def __post_init__(self) -> None:
-        require(
-            1 <= self.test <= self.train, f"test must lie between 1 and train, {self.train}, but it is {self.test}."
-        )
-
-    def poses(self) -> tuple[np.ndarray, np.ndarray]:
-        """Rotations [V, 3, 3], those for training first, and which of them are held out [V] bool."""
-        gaps = np.floor((np.arange(self.test) + 0.5) * self.train / self.test)
-        angles = np.concatenate([np.arange(self.train), gaps + 0.5]) * (180 / self.train)
-        return rotation_y(angles), np.arange(len(angles)) >= self.train
+        ...
 
 
 @checked_dataclass
@@ -160,11 +138,11 @@ class Declaration:
     differs from the flat field on frames for training; misalignment: errors of the geometry for methods."""
 
     summary: str
-    specimen: Specimen
+    specimen: SpecimenKind
     matter: Matter
     beam: Beam
     detector: Detector
-    views: Interleaved | Between | Listed
+    views: Directions
     prior: Literal["known", "ratio", "free"]
     photons: Photons | None = None
     light: UnevenLight = EVEN_LIGHT
@@ -205,13 +183,10 @@ class Declaration:
         The core of a mesh adds what it is filled with, less the material around it.
         """
         material, medium = self._delta_beta(self.matter.material), self._delta_beta(self.matter.medium)
-        if isinstance(self.specimen, Continuous):
+        if isinstance(self.specimen, ContinuousKind):
             cores = [self._delta_beta(self.matter.core).against(medium)] if self.matter.core else []
             return *self.specimen.continuous(seed, [material.against(medium), *cores]), ()
-        if not isinstance(self.specimen, Meshed):
-            core = None if self.matter.core is None else self._delta_beta(self.matter.core)
-            found = self.specimen.drawn(Substances(material, core, medium), seed)
-            return found.scene, found.text, ()
+        assert isinstance(self.specimen, MeshedKind)
         bodies = self.specimen.bodies(seed, snapshots)
         filling = [material.against(medium)] * len(bodies.outer)
         if self.matter.core is not None:
@@ -225,41 +200,6 @@ class Declaration:
 
     def _delta_beta(self, substance: Substance) -> DeltaBeta:
         return substance.delta_beta(self.beam.energy_kev)
-
-
-def declared_names(path: Path) -> list[str]:
-    """The cases of a file: its variants, or, without any, one by the file's own name."""
-    return list(_variants(path, read_table(path))) or [path.stem]
-
-
-def read_declaration(path: Path, name: str, with_snapshots: bool = False) -> Declaration:
-    """The case `name` of a file, checked; `InputError` names the file and the entry at fault.
-
-    with_snapshots: whether simulated cells are at hand, such that the file's `[with_snapshots]` applies.
-    """
-    tables = read_table(path)
-    variants = _variants(path, tables)
-    known = ", ".join(variants) or path.stem
-    require(
-        name in variants or (not variants and name == path.stem),
-        f"the case must be one of those in {path}, {known}, but it is {name!r}.",
-    )
-    plain = {key: value for key, value in tables.items() if key not in ("variants", "with_snapshots")}
-    where_given = tables.get("with_snapshots", {})
-    require(isinstance(where_given, dict), f"{path}: with_snapshots must be a table, but it is {where_given!r}.")
-    if with_snapshots:
-        plain = merged(plain, where_given)
-    try:
-        return from_table(Declaration, merged(plain, variants.get(name, {})))
-    except InputError as error:
-        raise InputError(f"{path}, case {name}: {error}") from None
-
-
-def _variants(path: Path, tables: dict[str, Any]) -> dict[str, Any]:
-    variants = tables.get("variants", {})
-    good = isinstance(variants, dict) and all(isinstance(changes, dict) for changes in variants.values())
-    require(good, f"{path}: variants must be tables [variants.NAME], but it is {variants!r}.")
-    return variants
 
 
 @dataclass(frozen=True)
