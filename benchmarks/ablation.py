@@ -25,10 +25,10 @@ from rows import write
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import numpy as np
-from holosplat.beamline.declaration import Case
 from machine import commit
 
 import holosplat as hs
+from holosplat.beamline.declaration import Case
 from holosplat.methods import Task, finished
 from holosplat.methods.gaussians import GaussianStage
 from holosplat.workflows.evaluate import score_object

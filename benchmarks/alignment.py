@@ -19,13 +19,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from holosplat.beamline.declaration import Case
 from rows import merge
 from scipy.spatial.transform import Rotation
 
 import holosplat as hs
 from holosplat.align import PoseOptions, PosePrior, align_views
 from holosplat.align.derivatives import moved_onto
+from holosplat.beamline.declaration import Case
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.methods import Auto, Gaussians, Method
 from holosplat.metrics import volume_scores

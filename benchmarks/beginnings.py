@@ -21,11 +21,11 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import numpy as np
 import torch
-from holosplat.beamline.declaration import Case
 from machine import commit
 from rows import written
 
 import holosplat as hs
+from holosplat.beamline.declaration import Case
 from holosplat.methods import smooth_fit
 from holosplat.methods.illumination import prepared
 from holosplat.methods.method import Task, begun, run_quietly

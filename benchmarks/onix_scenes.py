@@ -22,11 +22,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from holosplat.beamline.declaration import Case
 from machine import commit
 from rows import read, write
 
 import holosplat as hs
+from holosplat.beamline.declaration import Case
 from holosplat.geometry import Grid
 from holosplat.methods import Onix
 from holosplat.training.aligned import AlignedTraining, AlignedValidation

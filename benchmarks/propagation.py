@@ -32,10 +32,10 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import numpy as np
 import torch
-from holosplat.beamline.declaration import Case
 from machine import commit
 from rows import read, write
 
+from holosplat.beamline.declaration import Case
 from holosplat.beamline.simulate import Simulation, simulated_frames
 from holosplat.model import Instrument
 from holosplat.scan import Exposures

@@ -22,6 +22,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from machine import commit
+from rows import read, write
+
+import holosplat as hs
 from holosplat.beamline.declaration import (
     Beam,
     Case,
@@ -32,10 +36,6 @@ from holosplat.beamline.declaration import (
     Substance,
     case_of,
 )
-from machine import commit
-from rows import read, write
-
-import holosplat as hs
 from holosplat.beamline.light import UnevenLight
 from holosplat.geometry import Grid
 from holosplat.metrics import volume_scores

@@ -14,10 +14,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from holosplat.beamline.declaration import Case
 from machine import commit
 from rows import written
 
+from holosplat.beamline.declaration import Case
 from holosplat.model import Instrument
 from holosplat_bench.suite.case import load_case
 from holosplat_bench.thesis.configurations import PHYSICS

@@ -26,9 +26,9 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 import numpy as np
 import torch
 from changes import changed
-from holosplat.beamline.declaration import Case
 from machine import commit
 
+from holosplat.beamline.declaration import Case
 from holosplat.methods import Method, NeuralFields, NeuralFit, Task, VoxelFit, Voxels, finished
 from holosplat.methods.presets import preset
 from holosplat.methods.voxels import HolographicStage

@@ -16,11 +16,11 @@ from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
-from holosplat.beamline.declaration import Case
 from machine import commit
 
 from holosplat.baselines import holographic_tv
 from holosplat.baselines.two_materials import Levels, best_levels
+from holosplat.beamline.declaration import Case
 from holosplat.matter import MaterialPrior
 from holosplat.methods.ground import assumed_material
 from holosplat.methods.presets import preset

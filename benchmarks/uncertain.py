@@ -18,9 +18,9 @@ from rows import written
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
-from holosplat.beamline.declaration import Case
 from machine import commit
 
+from holosplat.beamline.declaration import Case
 from holosplat.matter import KnownRatio, MaterialPrior
 from holosplat.methods import Task
 from holosplat.methods.illumination import prepared

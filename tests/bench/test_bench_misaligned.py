@@ -8,12 +8,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from holosplat.beamline.declaration import Case
 from scipy.spatial.transform import Rotation
 
 import holosplat as hs
 from helpers.bench_shop import MATERIAL, PITCH
 from holosplat.align.derivatives import moved_onto
+from holosplat.beamline.declaration import Case
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.matter import Matter
 from holosplat.representations.voxels import VoxelGrid

@@ -10,11 +10,11 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from holosplat.beamline.declaration import Case
 from scipy.ndimage import gaussian_filter
 
 import holosplat as hs
 from helpers.bench_shop import MATERIAL, PITCH, Recorder, fail, make_case, suite, voxels
+from holosplat.beamline.declaration import Case
 from holosplat.matter import Matter
 from holosplat.optics.sampling import fringe_sampling
 from holosplat.representations import NeuralField, SurfaceMesh, VoxelGrid

@@ -8,9 +8,9 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-from holosplat.beamline.declaration import Case
 
 import holosplat as hs
+from holosplat.beamline.declaration import Case
 from holosplat.matter import Matter
 from holosplat.methods import Task
 from holosplat.representations.voxels import VoxelGrid

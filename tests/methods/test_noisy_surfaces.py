@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from helpers.bumpy import bumpy, surfaces
-from helpers.noisy_cells import MATTER, PITCH, error, mesh_of, task_of
+from helpers.noisy_cells import CELLS, MATTER, PITCH, error, mesh_of, task_of
 from holosplat.baselines import HolographicTV, holographic_tv
 from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
@@ -240,8 +240,9 @@ def test_a_body_that_is_missing_joins(noisy, monkeypatch):
     told = list[Decision]()
     task = replace(noisy, on_start=lambda decision, guess: told.append(decision))
     found, _ = best_cut(task, 3)
-    assert len(found.bodies()) == 4
-    assert error(found) < 0.3 * error(mesh_of(3))
+    cells = [body for body in found.bodies() if body.volume > 0.3 * CELLS[3].volume]
+    assert len(cells) == 4
+    assert error(found) < 0.5 * error(mesh_of(3))
     assert (told[-1].name, told[-1].choice, told[-1].by) == ("surfaces", MORE, BY_VIEWS)
 
 
@@ -276,7 +277,8 @@ def test_what_is_too_much_is_not_made_up_for_elsewhere(noisy):
 
 
 def test_bodies_of_several_materials_get_none(noisy):
-    two = replace(mesh_of(), matter=Matter.several(MATTER, WATER.delta_beta(20.0)))
+    one, two = mesh_of(), Matter.several(MATTER, WATER.delta_beta(20.0))
+    two = SurfaceMesh(one.vertices, one.faces, PITCH, two, parts=(len(one.faces) // 2,) * 2)
     assert with_missing_bodies(noisy, two, HOW, OPTIONS.coarse) is None
 
 

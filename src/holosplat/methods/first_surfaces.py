@@ -20,6 +20,7 @@ from ..checks import InputError, require
 from ..geometry import Grid
 from ..inference import Score, select
 from ..matter import DeltaBeta, Matter
+from ..mesh import TriangleMesh, joined
 from ..optics.noise import noise_share
 from ..representations import GaussianCloud, SurfaceMesh, VoxelGrid
 from .coarse import CoarseToFine, Way, settled, unexplained
@@ -228,8 +229,9 @@ def with_missing_bodies(
 
     The thickness that explains what `found` leaves of the frames (`Correction`) changes its occupancy within 0 and 1,
     by SIRT: what is too much is taken away where it is, and is not made up for by matter elsewhere. Where occupancy
-    is added, a body is missing, down to a voxel. Few views and noise make it faint, so that `levels`, from the lowest
-    on as long as less of the frames is left, are shares of the largest addition.
+    is added, a body is missing; it has at least the volume of a voxel, in the end, too. Few views and noise make it
+    faint, so that `levels`, from the lowest on as long as less of the frames is left, are shares of the largest
+    addition.
     """
     if not found.matter.single:
         return None
@@ -245,19 +247,19 @@ def with_missing_bodies(
             bodies = cut_surfaces(added / largest, grid, task.scan.views.finest, found.matter, every)
         except InputError:  # none has the volume of a voxel
             break
-        more = settled(task, _joined(found, bodies), surfaces, how)
+        more = settled(task, _of_bodies([found.mesh(), bodies.mesh()], found), surfaces, how)
+        more = _of_bodies([body for body in more.bodies() if body.volume >= more.unit_length**3], more)
         if (left_over := _left(task, more, surfaces)) >= least:
             break
         best, least = (level, more), left_over
     return best
 
 
-def _joined(one: SurfaceMesh, other: SurfaceMesh) -> SurfaceMesh:
-    """Both, in the unit of `one`."""
-    scale = other.unit_length / one.unit_length
-    vertices = torch.cat([one.vertices.cpu(), scale * other.vertices.cpu()])
-    faces = torch.cat([one.faces.cpu(), other.faces.cpu() + len(one.vertices)])
-    return SurfaceMesh(vertices, faces, one.unit_length, one.matter, one.lines)
+def _of_bodies(bodies: Sequence[TriangleMesh], like: SurfaceMesh) -> SurfaceMesh:
+    """Surfaces of `bodies` [m], of the unit and the one material of `like`."""
+    whole = joined(bodies)
+    vertices = torch.from_numpy(whole.vertices / like.unit_length)
+    return SurfaceMesh(vertices, torch.from_numpy(whole.faces), like.unit_length, like.matter, like.lines)
 
 
 def _left(task: Task, found: SurfaceMesh, surfaces: SurfaceOptions) -> float:

@@ -112,7 +112,6 @@ def run(
         list_only: Only list cases and methods.
     """
     from holosplat.beamline.declaration import Case
-
     from holosplat.io.lock import sole_writer
 
     from ..suite.case import case_names, load_case

@@ -7,8 +7,8 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from holosplat.beamline.declaration import Case, case_of
 
+from holosplat.beamline.declaration import Case, case_of
 from holosplat.checks import InputError, require, whole_seed
 from holosplat.scan import Exposures
 

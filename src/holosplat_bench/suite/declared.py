@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from holosplat.beamline.declaration import Declaration, Listed
 
+from holosplat.beamline.declaration import Declaration, Listed
 from holosplat.checks import InputError, in_range, require
 from holosplat.geometry import rotation_y
 from holosplat.io.vtk import SUFFIXES, read_meshes

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from holosplat.beamline.declaration import Case
 
 from holosplat.baselines.algebraic import filtered_backprojection
+from holosplat.beamline.declaration import Case
 from holosplat.beamline.light import EVEN_LIGHT, UnevenLight
 from holosplat.beamline.misalignment import AS_PLANNED, Misalignment
 from holosplat.checks import InputError, require

@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
-from holosplat.beamline.declaration import Case
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
 
 from holosplat.align.held_out import place_frames
 from holosplat.align.poses import PoseOptions
 from holosplat.backends import resolve
+from holosplat.beamline.declaration import Case
 from holosplat.checks import InputError, require
 from holosplat.metrics import resolution
 from holosplat.optics.sampling import fringe_sampling

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from holosplat.beamline.declaration import Case
 
+from holosplat.beamline.declaration import Case
 from holosplat.checks import InputError, at_least, require
 from holosplat.fit.density import DensityControl
 from holosplat.fit.problem import Schedule

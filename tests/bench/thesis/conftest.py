@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from holosplat.beamline.declaration import Case
 
+from holosplat.beamline.declaration import Case
 from holosplat.geometry import Views
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.matter import MaterialPrior
