@@ -61,7 +61,7 @@ def _halo(u: Tensor, parts: int) -> Tensor:
     fine = coarse[0, 0]
     for n, few in zip(u.shape, fine.shape):  # some five times as fast as torch's trilinear interpolation
         between = interpolate(torch.eye(few, device=u.device)[None], size=n, mode="linear", align_corners=False)[0]
-        fine = torch.tensordot(fine, between, dims=([0], [0]))
+        fine = torch.tensordot(fine, between, dims=([0], [0]))  # type: ignore[arg-type]
     return fine
 
 

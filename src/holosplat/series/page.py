@@ -24,8 +24,8 @@ from ..units import in_percent, two_digits
 from ..units import plain as in_digits
 from ..workflows.next_step import next_step
 from ..workflows.run_folder import RunFolder
-from ..workflows.verdict import Verdict
-from .folder import Row, plain, some
+from ..workflows.verdict import Verdict, some
+from .folder import Row, plain
 
 MOST_PICTURES = 160
 """Times whose phase map a page holds, at most: evenly chosen, about 8 kB each."""
