@@ -13,6 +13,7 @@ from helpers.series import CELL, SHAPE, known, moving
 from holosplat.checks import InputError
 from holosplat.inference import Decision
 from holosplat.io.nxtomo import write_scan
+from holosplat.io.volumes import read_volume
 from holosplat.specimens.phantoms import Ball
 from holosplat.specimens.red_cells import random_cells
 from holosplat.specimens.scene import MeshScene
@@ -115,7 +116,16 @@ def test_the_command_takes_what_was_chosen_says_of_each_time_and_goes_on(asked, 
     assert {row["explained"] for row in rows} <= {"0", "1"}
     text = (tmp_path / "out" / page).read_text(encoding="utf-8")
     assert "times set aside" in text
-    assert motion == "each" or f"of {TIMES} times are " in text
+    if motion == "still":
+        assert f"of {TIMES} times are " in text
+    else:
+        worked(command("export", tmp_path / "out", "--volume", tmp_path / "v.h5", "--time-frame", "all"))
+        last = tmp_path / "out" / "tasks" / "0000" / f"t{TIMES - 1:04d}"
+        worked(command("export", last, "--volume", tmp_path / "last.h5"))
+        one, other = (read_volume(tmp_path / name).delta for name in (f"v_t{TIMES - 1:04d}.h5", "last.h5"))
+        np.testing.assert_array_equal(one, other)
+        assert f"a series of {TIMES} times" in worked(command("info", tmp_path / "out")).out
+        refused(command("evaluate", tmp_path / "out"), "it is a series, each time of which has a run folder")
     monkeypatch.setattr(motion_choice, "choose_motion", missing)  # nobody asks it again
     again = worked(command(*asked, "--resume"))
     assert found.line in again.err

@@ -13,7 +13,7 @@ from ..io.reading import Reading
 from ..memory import uncollected
 from ..units import beam_named, in_percent
 from ..workflows.choice import Choice
-from ..workflows.run_folder import RunFolder
+from ..workflows.run_folder import SERIES, RunFolder
 
 if TYPE_CHECKING:
     from ..planning.scan_facts import ScanFacts
@@ -50,7 +50,10 @@ def info(path: str | Path, reading: Reading = Reading(), picture: Path | None = 
         require_writable(picture)
     found = None
     try:
-        found = facts_of_run(RunFolder(path)) if RunFolder(path).config.is_file() else facts_of_matter(path)
+        if (path / SERIES).is_file():
+            found = facts_of_series(path)
+        else:
+            found = facts_of_run(RunFolder(path)) if RunFolder(path).config.is_file() else facts_of_matter(path)
         scan = _of_scan(path, reading) if found is None else None
     except InputError as error:
         found, scan = no_kind(path, error), None
@@ -74,6 +77,24 @@ def _of_scan(path: Path, reading: Reading) -> ScanFacts:
         from ..planning.scan_facts import facts_of_scan  # needs torch, which takes longer than all else
 
     return facts_of_scan(loader, path, reading)
+
+
+def facts_of_series(path: Path) -> Facts:
+    """The facts of a series. Errors: `InputError` for files that are damaged."""
+    with uncollected():
+        from ..series.folder import SeriesFolder, time_left, verdict_of
+        from ..series.run import states
+        from ..workflows.motion_choice import begun_motion
+
+    folder = SeriesFolder(path)
+    plan = folder.plan()
+    rows = [row for window in plan.windows() for row in folder.rows(window)]
+    chosen, scans = begun_motion(path), [str(source.path) for source in plan.sources]
+    said = {"what": f"a series of {len(plan.moments())} times", "made from": ", ".join(scans)}
+    said |= {"state": time_left(states(folder)), "verdict": "; ".join(line.strip() for line in verdict_of(rows))}
+    said |= {"chosen": chosen.line} if chosen else {}
+    commands = (f"holosplat series collect {path}", f"holosplat export {path} --volume v.h5 --time-frame all")
+    return Facts(said, (), commands)
 
 
 def facts_of_run(folder: RunFolder) -> Facts:

@@ -210,5 +210,5 @@ def page_of(folder: SeriesFolder, found: Collected) -> SeriesPage:
         if apart == apart
     ]
     chosen = begun_motion(folder.path)
-    summary = f"{time_left(found.states)}." + (f" Chosen by --motion auto: {chosen.line}." if chosen else "")
+    summary = f"{time_left(found.states)}." + (f" {chosen.line.replace('-', '−')}." if chosen else "")
     return SeriesPage("A series", headline(verdict, frames), summary, tuple(frames), failed, tuple(notes))

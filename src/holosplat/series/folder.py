@@ -16,6 +16,7 @@ from ..io.atomic import atomic_folder, read_json, require_new, write_json
 from ..io.leftovers import is_hidden
 from ..io.lock import Writer, writer_of
 from ..tables import from_table
+from ..workflows.run_folder import SERIES
 from ..workflows.verdict import said_of_times
 from .plan import SeriesPlan, Window, natural
 
@@ -118,7 +119,7 @@ def verdict_of(rows: Sequence[Row]) -> list[str]:
     return said_of_times(judged, len(rows))
 
 
-PLAN, TASKS, DONE, FAILED = "series.json", "tasks", "done.json", "failed.json"
+PLAN, TASKS, DONE, FAILED = SERIES, "tasks", "done.json", "failed.json"
 State = Literal["done", "running", "failed", "left"]
 
 
