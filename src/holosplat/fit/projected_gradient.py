@@ -136,23 +136,18 @@ def direction(
     left, used = only(gradient), list[tuple[Tensor, Tensor, float, float]]()
     for step, change in reversed(pairs):
         s, y = only(step), only(change)
-        curved = product(s, y)
+        curved = float((s * y).sum())
         if curved > BENT * float(s.norm() * y.norm()):
-            share = product(s, left) / curved
-            left = left.sub(y, alpha=share)
+            share = float((s * left).sum()) / curved
+            left = left - share * y
             used.append((s, y, curved, share))
     result = only(inverse(left))
     if used:
         _, y, curved, _ = used[0]
-        result = result * (curved / product(y, inverse(y)))
+        result = result * (curved / float((y * inverse(y)).sum()))
     for s, y, curved, share in reversed(used):
-        result = result.add(s, alpha=share - product(y, result) / curved)
-    return -result if product(result, gradient) > 0 else -only(inverse(only(gradient)))
-
-
-def product(a: Tensor, b: Tensor) -> float:
-    """The scalar product of two arrays, some ten times as fast as the sum of their product."""
-    return float(torch.dot(a.flatten(), b.flatten()))
+        result = result + (share - float((y * result).sum()) / curved) * s
+    return -result if float((result * gradient).sum()) > 0 else -only(inverse(only(gradient)))
 
 
 class QuasiNewton:
