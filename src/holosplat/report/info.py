@@ -82,16 +82,19 @@ def _of_scan(path: Path, reading: Reading) -> ScanFacts:
 def facts_of_series(path: Path) -> Facts:
     """The facts of a series. Errors: `InputError` for files that are damaged."""
     with uncollected():
-        from ..series.folder import SeriesFolder, time_left, verdict_of
-        from ..series.run import states
         from ..workflows.motion_choice import begun_motion
+        from ..workflows.verdict import said_of_times
 
-    folder = SeriesFolder(path)
-    plan = folder.plan()
-    rows = [row for window in plan.windows() for row in folder.rows(window)]
-    chosen, scans = begun_motion(path), [str(source.path) for source in plan.sources]
-    said = {"what": f"a series of {len(plan.moments())} times", "made from": ", ".join(scans)}
-    said |= {"state": time_left(states(folder)), "verdict": "; ".join(line.strip() for line in verdict_of(rows))}
+    with as_written(path / SERIES, "the plan of a series"):
+        scans = [(str(one["path"]), len(one["times_s"])) for one in read_json(path / SERIES)["scans"]]
+    with as_written(path, "rows of a series"):
+        rows = {row["number"]: row for row in map(read_json, sorted(path.glob("tasks/*/*.row.json")))}
+        done = [row for _, row in sorted(rows.items()) if row["status"] == "done"]
+        judged = [(row["number"], bool(row["good"]), str(row["words"])) for row in done if row["good"] is not None]
+    chosen, count = begun_motion(path), sum(times for _, times in scans)
+    said = {"what": f"a series of {count} times", "made from": ", ".join(scan for scan, _ in scans)}
+    said |= {"state": f"{len(done)} of {count} times are done"}
+    said |= {"verdict": "; ".join(line.strip() for line in said_of_times(judged, count))} if judged else {}
     said |= {"chosen": chosen.line} if chosen else {}
     commands = (f"holosplat series collect {path}", f"holosplat export {path} --volume v.h5 --time-frame all")
     return Facts(said, (), commands)
