@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import groupby
+
 from .benchmark import Row, markdown, read, rounded, table
 
 WAYS = {
@@ -108,6 +110,21 @@ def changing() -> str:
         lines.append([f"{name}, {seed}", str(len(own)), *_worst(own), _events(own), _front(own), _spent(own)])
     columns = ("series, seed", "times", "error of δ", "Dice", "total", "holes", "explained", "events told of true ones")
     return markdown((*columns, "front, pixels", "time taken"), lines)
+
+
+@table("chosen_motion", "python benchmarks/chosen_motion.py", "a quarter of an hour", "chosen_motion.csv")
+def chosen_motion() -> str:
+    """What `--motion auto` chose for each scene, and its errors beside those of each time by itself."""
+    lines = []
+    for name, group in groupby(read("chosen_motion.csv"), key=lambda r: r["scene"]):
+        own = list(group)
+        pairs = [(float(r["error"]), float(r["each_error"])) for r in own]
+        errors = [" – ".join(f"{ends(found):.3f}" for ends in (min, max)) for found in zip(*pairs)]
+        explained = [f"{sum(r[key] == '1' for r in own)} of {len(own)}" for key in ("explained", "each_explained")]
+        told = (own[0]["choice"], own[0]["gains"].replace("-", "−"), *errors, *explained)
+        lines.append([f"{name}, {own[0]['pixels']} px", *told, f"{float(own[0]['seconds']):.0f} s"])
+    columns = ("scene", "taken", "smaller residual of frames set aside, %", "error of δ", "by `each`")
+    return markdown((*columns, "explained", "by `each`", "processor time"), lines)
 
 
 def _worst(rows: list[Row]) -> list[str]:

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
-from helpers.cli import PIXEL, QUICK, refused
+from helpers.cli import PIXEL, QUICK, refused, worked
 from helpers.cli import holosplat as command
 from helpers.series import CELL, SHAPE, known, moving
 from holosplat.checks import InputError
-from holosplat.cli import commands
-from holosplat.cli.commands import Asked, CarriedFlags
 from holosplat.inference import Decision
 from holosplat.io.nxtomo import write_scan
-from holosplat.io.reading import Reading
+from holosplat.io.volumes import read_volume
 from holosplat.specimens.phantoms import Ball
 from holosplat.specimens.red_cells import random_cells
 from holosplat.specimens.scene import MeshScene
+from holosplat.tables import read_rows, to_table
 from holosplat.workflows import motion_choice
-from holosplat.workflows.motion_choice import choose_motion, decide
+from holosplat.workflows.motion_choice import MOTION, begun_motion, choose_motion, decide
 
 TIMES = 6
 
@@ -90,14 +91,64 @@ def test_few_times_and_few_frames_are_refused(scan):
         choose_motion(single, known(20.0))
 
 
-def test_the_command_takes_the_motion_that_was_chosen(scan, tmp_path, monkeypatch, capsys):
+@pytest.fixture
+def asked(scan, tmp_path):
+    """A command that decides, with quick options."""
     write_scan(tmp_path / "scan.nxs", scan)
-    found = Decision("motion", "bodies", "times set aside")
+    (tmp_path / "quick.json").write_text(json.dumps({"method": to_table(QUICK)}), encoding="utf-8")
+    said = ["reconstruct", tmp_path / "scan.nxs", "--motion", "auto", "--material", "haemoglobin", "--matter", "levels"]
+    return [*said, "--config", tmp_path / "quick.json", "--out", tmp_path / "out"]
+
+
+@pytest.mark.usefixtures("unjudged_runs")
+@pytest.mark.parametrize("motion", ["still", "each"])
+def test_the_command_takes_what_was_chosen_says_of_each_time_and_goes_on(asked, motion, tmp_path, monkeypatch):
+    """Which is kept with the folder, so that a run goes on without a decision, and stands on its page."""
+    found = Decision(MOTION, motion, "times set aside")
     monkeypatch.setattr(motion_choice, "choose_motion", lambda *args, **how: found)
-    asked = commands._with_motion(tmp_path / "scan.nxs", Asked(motion=CarriedFlags("auto")), Reading(), 0)
-    assert asked.motion.motion == "bodies"
-    assert found.line in capsys.readouterr().err
-    said = ["reconstruct", tmp_path / "scan.nxs", "--motion", "auto", "--out", tmp_path / "out"]
-    refused(command(*said, "--resume"), "--motion auto decides anew")
-    refused(command(*said, "--time-frame", 1), "--motion auto takes all times")
-    refused(command(*said, "--refine", "shifts"), "--refine is of one time")
+    first = worked(command(*asked))
+    assert found.line in first.err
+    assert begun_motion(tmp_path / "out") == found
+    assert f"of {TIMES} times are " in first.out
+    table, page = ("times.csv", "report.html") if motion == "still" else ("series.csv", "series.html")
+    rows = read_rows(tmp_path / "out" / table, "")
+    assert [int(row["number"]) for row in rows] == list(range(TIMES))
+    assert {row["explained"] for row in rows} <= {"0", "1"}
+    text = (tmp_path / "out" / page).read_text(encoding="utf-8")
+    assert "times set aside" in text
+    if motion == "still":
+        assert f"of {TIMES} times are " in text
+    else:
+        worked(command("export", tmp_path / "out", "--volume", tmp_path / "v.h5", "--time-frame", "all"))
+        last = tmp_path / "out" / "tasks" / "0000" / f"t{TIMES - 1:04d}"
+        worked(command("export", last, "--volume", tmp_path / "last.h5"))
+        one, other = (read_volume(tmp_path / name).delta for name in (f"v_t{TIMES - 1:04d}.h5", "last.h5"))
+        np.testing.assert_array_equal(one, other)
+        assert f"a series of {TIMES} times" in worked(command("info", tmp_path / "out")).out
+        refused(command("evaluate", tmp_path / "out"), "it is a series, each time of which has a run folder")
+    monkeypatch.setattr(motion_choice, "choose_motion", missing)  # nobody asks it again
+    again = worked(command(*asked, "--resume"))
+    assert found.line in again.err
+
+
+def test_what_was_begun_without_a_decision_does_not_go_on_with_one(asked, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "config.json").write_text("{}", encoding="utf-8")
+    refused(command(*asked, "--resume"), "was begun without it; name the --motion of that")
+    assert begun_motion(tmp_path / "out") is None
+
+
+def test_what_is_of_one_time_is_refused_before_the_decision(asked):
+    refused(command(*asked, "--time-frame", 1), "--motion auto takes all times")
+    refused(command(*asked, "--refine", "shifts"), "--refine is of one time")
+    refused(command(*asked, "--strict"), "--view and --strict are of one time")
+
+
+def test_progress_says_what_is_tried(monkeypatch):
+    heard = set[str]()
+    monkeypatch.setattr(motion_choice, "reconstruct_moving", lambda *args, **how: how["on_progress"]("fit", 0.5, {}))
+    monkeypatch.setattr(motion_choice, "track", lambda part, *args, **how: missing(part))
+    choose_motion(moving(6), known(20.0), QUICK, matter="levels", on_progress=lambda stage, *_: heard.add(stage))
+    assert "motion, flow: fit" in heard
+    for way in ("still", "a time by itself"):
+        assert any(stage.startswith(f"motion, {way}: ") for stage in heard)

@@ -174,11 +174,11 @@ def misfit_spectrum(rays: Rays, misfit: Tensor) -> Tensor:
 
 def plateau(occupancy: Tensor) -> float:
     """The level [units of `occupancy`] that most of the matter has: the mass-weighted median of [Z, Y, X] ≥ 0."""
-    values = occupancy[occupancy > 0].sort().values
+    values = np.sort(occupancy[occupancy > 0].cpu().numpy())  # some three times as fast as torch
     if not len(values):
         raise NoMatterError
-    mass = values.double().cumsum(0)
-    return float(values[int(torch.searchsorted(mass, 0.5 * mass[-1]))])
+    mass = values.cumsum(dtype=np.float64)
+    return float(values[mass.searchsorted(0.5 * mass[-1])])
 
 
 TOMOGRAPHIES: dict[str, Tomography] = {

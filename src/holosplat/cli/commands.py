@@ -17,7 +17,7 @@ from .light import RunLightFlags
 from .options import BeamlineOptions, MethodOptions, PriorOptions
 from .places import Output
 from .progress import ProgressBar
-from .sentence import INTERRUPTED, put, say, tell_frames, tell_reconstruction
+from .sentence import INTERRUPTED, interruptible, put, say, tell_frames, tell_reconstruction
 from .simulate import TruthOptions
 from .view import LiveFlags, watched
 
@@ -88,7 +88,8 @@ class Asked:
 
         require(self.geometry.options() is None, "--refine is of one time; find the one geometry by holosplat align.")
         ranges = [*self.matter.ranges(), *reading.told.ranges()]
-        require(not ranges, "--motion each needs one number for each constant; find it by reconstruct of one time.")
+        named = self.motion.motion or "each"
+        require(not ranges, f"--motion {named} needs one number for each constant; find it by reconstruct of one time.")
         shared = {"light": self.illumination.options(), "seed": seed}
         return Settings("reconstruct", method, self.how.kind_of_matter(), **shared)
 
@@ -145,13 +146,14 @@ def reconstruct(
     from ..workflows.run_folder import RunFolder, claimed
     from .track import asks_for_motion, may_go_on, reconstruct_in_motion
 
+    method, begun = asked.how.chosen(), asked.motion.applied(reading)
+    by_time = asked.motion.motion in ("auto", "bodies") or begun.part.time_frame == "each"
+    require(not (by_time and (live.view or strict)), "--view and --strict are of one time; leave them, or choose one.")
     if asked.motion.motion == "auto":
-        require(not resume, "--motion auto decides anew; go on with the --motion that it chose and --resume.")
-        asked = _with_motion(scan, asked, reading, seed)
-    method, reading = asked.how.chosen(), asked.motion.applied(reading)
+        asked = _with_motion(scan, out, asked, reading, seed, resume)
+    reading = asked.motion.applied(reading)
     asked.motion.require_all(reading)
     if asked.motion.motion == "bodies" or reading.part.time_frame == "each":
-        require(not (live.view or strict), "--view and --strict are of one time; leave them, or choose a time.")
         _time_by_time(scan, out, asked, reading, seed, resume)
         return
     if method.of_series and reading.part.time_frame == "all":
@@ -183,17 +185,27 @@ def reconstruct(
     _end(result, out, strict)
 
 
-def _with_motion(scan: Path, asked: Asked, reading: Reading, seed: int) -> Asked:
-    """What is asked, with the motion that frames choose."""
+def _with_motion(scan: Path, out: Path, asked: Asked, reading: Reading, seed: int, resume: bool) -> Asked:
+    """What is asked, with the motion that frames choose, or have chosen for what is begun in `out`."""
+    from ..io.atomic import is_taken
     from ..io.formats import read_frames
-    from ..workflows.motion_choice import choose_motion
+    from ..io.provenance import command_now
+    from ..workflows.motion_choice import MOTION, begun_motion, choose_motion
 
-    asked.motion.applied(reading)  # which refuses a time
     settings = asked.each_time(asked.how.chosen(), reading, seed)
-    measured = read_frames(scan, reading).in_memory()
-    prior = asked.matter.prior(measured.exposures.reference_energy)
-    how = {"light": settings.light, "matter": settings.matter}
-    decision = choose_motion(measured, prior, settings.method, seed, **how)
+    decision = begun_motion(out) if resume else None
+    if decision is None:
+        require(
+            not (resume and is_taken(out)),
+            f"--motion auto goes on with what it has begun, but {out} was begun without it; name the --motion of that.",
+        )
+        measured = read_frames(scan, reading).in_memory()
+        prior = asked.matter.prior(measured.exposures.reference_energy)
+        with interruptible(lambda: "interrupted before the motion was chosen"), ProgressBar() as bar:
+            how = {"light": settings.light, "matter": settings.matter, "on_progress": bar.show}
+            decision = choose_motion(measured, prior, settings.method, seed, **how)
+        if command := command_now():
+            command.decided[MOTION] = decision.as_dict()
     say(decision.line)
     chosen = {each: each for each in ("still", "each", "flow", "bodies")}[decision.choice]
     return replace(asked, motion=replace(asked.motion, motion=chosen))
@@ -217,8 +229,9 @@ def _scored(
     folder: RunFolder, result: Reconstruction, measured: Scan, scan: Path, reading: Reading
 ) -> tuple[Evaluation, Path]:
     """The scores of a run on its frames, and its report; the folder then knows where its frames are."""
-    from ..io.formats import run_source
+    from ..io.formats import read_frames, run_source
     from ..report.run import report_run
+    from ..workflows.evaluate import TIMES, write_times
     from ..workflows.evaluate import evaluate as score
     from ..workflows.reconstruction import instants_of
     from .track import report_of_middle
@@ -227,6 +240,9 @@ def _scored(
     folder.write_source(run_source(scan, replace(reading, told=found)))
     placed = result.placed(measured)
     evaluation = score(result, placed, None)
+    if reading.part.time_frame in ("all", "still"):
+        each = result.placed(read_frames(scan, replace(reading, part=replace(reading.part, time_frame=None))))
+        write_times(folder.path / TIMES, result, each.in_memory(), evaluation.light)
     if instants_of(folder):
         return evaluation, report_of_middle(folder, result, placed)
     return evaluation, report_run(folder, result, placed, evaluation, None)
@@ -247,6 +263,7 @@ def _end(result: Reconstruction, out: Path, strict: bool) -> None:
 def _print_result(folder: RunFolder, result: Reconstruction, report: Path) -> None:
     """What was found and decided, and whether it explains the frames."""
     from ..io.atomic import read_json
+    from ..workflows.evaluate import TIMES, lines_of_times
 
     if folder.light.is_file():
         say(f"light: {read_json(folder.summary)['light']} ({folder.light})")
@@ -254,7 +271,7 @@ def _print_result(folder: RunFolder, result: Reconstruction, report: Path) -> No
     put(result.geometry.lines() if result.geometry else ())
     put(result.choice.lines())
     say(f"{sum(result.timing.values()):.1f} s, {result.object.described}; report: {report}")
-    put(result.verdict.lines("training frames") if result.verdict else ())
+    put((*(result.verdict.lines("training frames") if result.verdict else ()), *lines_of_times(folder.path / TIMES)))
     if result.total:
         print(result.total.words)
     say(f"not rehearsed: for intervals of these numbers, and a verdict beside them: holosplat rehearse {folder.path}")

@@ -58,7 +58,7 @@ def export(
     """Write δ and β of a run as a volume, its bodies as meshes, or its object in few bytes or as splats.
 
     Args:
-        run: Run folder.
+        run: Run folder, or the folder of a series of single times.
         volume: Volume to write, by its suffix: .h5 or .hdf5, HDF5; .vti, for ParaView and PyVista; .nrrd, for 3D Slicer
             and ITK; .mrc, for ChimeraX; .tif or .tiff, an OME-TIFF; .zarr, a folder of OME-Zarr (extra zarr). NRRD and
             MRC hold δ alone, and β in NAME.beta.nrrd or NAME.beta.mrc. Of absorption alone µ [1/m] stands in δ's place.
@@ -69,15 +69,15 @@ def export(
         bodies: Of a run of surfaces: a folder to make, with one VTK file a body (µm), the largest first, or of a run
             of track the same body under the same name at all times; or by its suffix one file of all bodies, .vtu
             (VTK, µm), .stl (µm) or .glb (glTF, m).
-        time_frame: Of a run of track: the time, counted from 0 (default: the first), or all, to files and folders whose
-            names end with _t0000 and so on, or to one .glb in which the bodies move. Beside HDF5 a .xdmf, beside .vti
-            and .vtu a .pvd opens all times in ParaView.
+        time_frame: Of a series, and of a run of track: the time, counted from 0 (default: the first), or all, to files
+            and folders whose names end with _t0000 and so on, or of track to one .glb in which the bodies move. Beside
+            HDF5 a .xdmf, beside .vti and .vtu a .pvd opens all times in ParaView.
     """
     from ..io.formats import of_time
     from ..io.volumes import REFRACTION
     from ..workflows.reconstruction import instants_of
     from ..workflows.run_folder import RunFolder
-    from .scans import moments_of
+    from .scans import moments_of, runs_of
 
     require(
         any((volume, bodies, objects.compact, objects.splats)),
@@ -86,8 +86,10 @@ def export(
     require(objects.compact is not None or not objects.together, "--together needs --compact; name its file.")
     folder = RunFolder(run)
     _require_suffixes(volume, bodies, objects)
-    every = range(len(instants_of(folder))) if time_frame == "all" else ()
-    moving = bodies is not None and time_frame == "all" and bodies.suffix.lower() == GLB and _moves(folder)
+    single = runs_of(run)
+    every = range(len(single or instants_of(folder))) if time_frame == "all" else ()
+    moving = not single and bodies is not None and time_frame == "all" and bodies.suffix.lower() == GLB
+    moving = moving and _moves(folder)
     timed = [path for path in (volume, None if moving else bodies, objects.splats) if path is not None]
     _require_free(timed, every)
     if objects.compact is not None:
@@ -104,7 +106,7 @@ def export(
             if path is bodies:
                 _export_bodies(one, out)
             elif path is volume:
-                grid = _export_volume(one.result, folder, out, (shape, voxel_size), one.frame)
+                grid = _export_volume(one.result, one.folder, out, (shape, voxel_size), None if single else one.frame)
             else:
                 _export_splats(one.result, out)
     for path in timed if every else ():

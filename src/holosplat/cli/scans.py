@@ -13,6 +13,7 @@ from ..io.reading import Reading, at_time
 from ..mesh import TriangleMesh
 from ..representations import InMotion, MovingSurfaces, SurfaceMesh
 from ..scan import Scan
+from ..series.folder import SeriesFolder
 from ..workflows.preconditions import require_one_time
 from ..workflows.reconstruct import load_reconstruction
 from ..workflows.reconstruction import Reconstruction, chosen_frames, instants_of, reconstruction_at, where_found
@@ -57,26 +58,44 @@ def run_and_scan(folder: RunFolder, scan: Path | None, reading: Reading) -> tupl
 @dataclass(frozen=True)
 class Moment:
     """A run as it is at one time. frame: the time's number, which names of its files add, or None; time [s]; bodies:
-    closed meshes [m], if it has them, of a run in motion in the order of their identities."""
+    closed meshes [m], if it has them, of a run in motion in the order of their identities; folder: of the run."""
 
     frame: int | None
     time: float
     result: Reconstruction
     bodies: list[TriangleMesh] | None
+    folder: RunFolder
+
+
+def runs_of(path: Path) -> list[tuple[float, RunFolder]]:
+    """The times [s] of a series of single times, and their run folders; nothing for what is no such series."""
+    series = SeriesFolder(path)
+    if not series.file.is_file() or series.plan().settings.act == "track":
+        return []
+    each = [(window.number, moment) for window in series.plan().windows() for moment in window.own]
+    return [(moment.time, RunFolder(series.run(task, moment.number))) for task, moment in each]
 
 
 def moments_of(folder: RunFolder, time_frame: int | Literal["all"] | None) -> Iterator[Moment]:
-    """A run at the times that are asked for.
+    """A run, or a series of single times, at the times that are asked for.
 
-    time_frame: of a run in motion, the time, counted from 0 (default: the first), or "all". Errors: `InputError` for
-    times that the run does not have, and for any of a run that stands still.
+    time_frame: of a series and of a run in motion, the time, counted from 0 (default: the first), or "all". Errors:
+    `InputError` for times that they do not have, and for any of a run that stands still.
     """
+    runs = runs_of(folder.path)
+    for k in chosen_frames(time_frame, [time for time, _ in runs]) if runs else ():
+        time, run = runs[k]
+        result = load_reconstruction(run)
+        bodies = result.object.bodies() if isinstance(result.object, SurfaceMesh) else None
+        yield Moment(k if time_frame == "all" else None, time, result, bodies, run)
+    if runs:
+        return
     result, times = load_reconstruction(folder), instants_of(folder)
     found = result.object
     if not isinstance(found, InMotion):
         require(time_frame is None, f"{folder.path} is of one time; leave --time-frame.")
-        yield Moment(None, 0.0, result, found.bodies() if isinstance(found, SurfaceMesh) else None)
+        yield Moment(None, 0.0, result, found.bodies() if isinstance(found, SurfaceMesh) else None, folder)
         return
     for k in chosen_frames(time_frame, times):
         bodies = found.bodies(times[k]) if isinstance(found, MovingSurfaces) else None
-        yield Moment(k if time_frame == "all" else None, times[k], reconstruction_at(result, times, k), bodies)
+        yield Moment(k if time_frame == "all" else None, times[k], reconstruction_at(result, times, k), bodies, folder)

@@ -16,12 +16,13 @@ from ..io.reading import Reading
 from ..matter import MaterialPrior
 from ..ranges import Jobs, Seed, checked_dataclass
 from ..series.collect import collect as join
-from ..series.folder import Row, SeriesFolder, line_of, some, table_of, time_left, verdict_of
+from ..series.folder import Row, SeriesFolder, line_of, table_of, time_left, verdict_of
 from ..series.plan import Cut, Settings, Slurm, Warm, listed, plan_series
 from ..series.run import run_left
 from ..series.stream import RECEIVED, SCHEME, Stream, Streaming
 from ..series.watch import Watch, WatchFolder, Watching
 from ..tables import to_table
+from ..workflows.verdict import some
 from .light import RunLightFlags
 from .options import MethodOptions, PriorOptions
 from .places import Kept, Output, with_checked_arguments

@@ -32,8 +32,8 @@ from ..ranges import Metres, Seed, Share, Weight, checked_dataclass
 from ..report.run import report_run
 from ..representations import MovingSurfaces
 from ..scan import Scan
+from ..workflows.evaluate import TIMES, lines_of_times, score_object, write_times
 from ..workflows.evaluate import evaluate as score
-from ..workflows.evaluate import score_object
 from ..workflows.provenance import scan_hash
 from ..workflows.reconstruct import load_reconstruction
 from ..workflows.reconstruction import Reconstruction, instants_of, reconstruction_at
@@ -169,9 +169,10 @@ def track(
     with claimed(folder):
         folder.write_source(run_source(scan, reading))
         evaluation = score(result, measured, None)
+        write_times(out / TIMES, result, measured, evaluation.light)
         report = report_run(folder, result, measured, evaluation, None)
     put((*evaluation.lines(), *result.choice.lines()))
-    put(result.verdict.lines("training frames") if result.verdict else ())
+    put((*(result.verdict.lines("training frames") if result.verdict else ()), *lines_of_times(out / TIMES)))
     seconds = sum(result.timing.values())
     say(f"{seconds:.1f} s, {result.object.described}; report: {report}")
     say(f"wrote {out / COLLECTION} ({BODIES}/), {out / TRACKS}")
@@ -227,8 +228,11 @@ def reconstruct_in_motion(
         return _still("nothing moves, as far as the frames tell")
     result = found.reconstruction
     folder.write_source(run_source(scan, reading))
-    evaluation, report = score(result, measured, None), report_of_middle(folder, result, measured)
+    evaluation = score(result, measured, None)
+    write_times(folder.path / TIMES, result, measured, evaluation.light)
+    report = report_of_middle(folder, result, measured)
     put((*evaluation.lines(), *(result.verdict.lines("training frames") if result.verdict else ())))
+    put(lines_of_times(folder.path / TIMES))
     seconds = sum(result.timing.values())
     for line in (*found.history, *(each.line for each in result.choice.decisions)):
         say(line)

@@ -53,6 +53,8 @@ class Command:
     folder: Path = field(default_factory=Path.cwd)
     done: set[Path] = field(default_factory=set)
     """Files that this command has written, and folders that have its record."""
+    decided: dict[str, Any] = field(default_factory=dict)
+    """What it decided before it wrote anything, by name."""
 
     _hashed: dict[tuple[Path, ...], dict[str, Any]] = field(default_factory=dict)
 
@@ -74,7 +76,8 @@ class Command:
             relative = {} if _is_private(place, near) else {"relative": os.path.relpath(place, near)}
             inputs.append({"path": home_safe(str(path)), **relative, **said})
         words = " ".join(map(_quoted, ["holosplat", *self.words]))
-        return {**_program(), "command": words, "folder": home_safe(str(self.folder)), "inputs": inputs}
+        said = {"command": words, "folder": home_safe(str(self.folder)), "inputs": inputs}
+        return {**_program(), **said, **({"decided": self.decided} if self.decided else {})}
 
 
 _now: list[Command] = []

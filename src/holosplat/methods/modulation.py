@@ -98,6 +98,17 @@ class Told(NamedTuple):
     limit: float
 
 
+class Linear(NamedTuple):
+    """Frames about a volume. u, changes: it and its K modulations [Z, Y, X]; spectra, left: of what these change of the
+    amplitudes [K, V, H, W//2 + 1], and of what u leaves of the measured ones; masses: of u and the changes [1 + K]."""
+
+    u: Tensor
+    changes: list[Tensor]
+    spectra: Tensor
+    left: Tensor
+    masses: Tensor
+
+
 class Ranges:
     """Misfits of frames in ranges of spatial frequencies that widen by octaves.
 
@@ -122,22 +133,27 @@ class Ranges:
         """What each range says of a volume u, each from where the narrower one before it has led."""
         found = list[Told]()
         with torch.no_grad():
+            about = self.about(u)
             for limit in limits:
                 for _ in range(UPDATES - 1):
-                    moved = self.told(u, limit).moved
-                    u = moved if bool((moved > 0).any()) else u
-                found.append(self.told(u, limit))
+                    moved = self.told(about, limit).moved
+                    about = self.about(moved) if bool((moved > 0).any()) else about
+                found.append(self.told(about, limit))
         return found
 
-    def told(self, u: Tensor, limit: float) -> Told:
-        """Least squares by frequencies up to `limit`."""
+    def about(self, u: Tensor) -> Linear:
+        """The frames about a volume u, for all ranges."""
         changes, problem = modulations(u, plateau(u)), self.problem
         lines = problem.lines(u)
         now = self.frames.amplitudes(lines)
         slopes = self.frames.slopes(lines, [problem.lines(change) for change in changes], now)
-        weight = self._weight(limit)
-        spectra = torch.fft.rfft2(torch.stack(slopes), norm="ortho")
-        left = torch.fft.rfft2(self._left(now), norm="ortho")
+        spectra, left = (torch.fft.rfft2(x, norm="ortho") for x in (torch.stack(slopes), self._left(now)))
+        return Linear(u, changes, spectra, left, torch.stack([self._inside(each) for each in (u, *changes)]))
+
+    def told(self, about: Linear, limit: float) -> Told:
+        """Least squares by frequencies up to `limit`."""
+        u, changes, spectra, left, (whole, *parts) = about
+        weight, masses = self._weight(limit), torch.stack(parts)
         weighted = (spectra * weight).flatten(1)
         matrix = (weighted @ spectra.flatten(1).conj().T).real.double()
         right = (weighted @ left.flatten().conj()).real.double()
@@ -145,10 +161,9 @@ class Ranges:
         shares = covariance @ right
         count = float(((self.radius <= limit) * self._twice).sum()) * len(left)
         chi2 = (float((weight * left.abs().square()).double().sum()) - float(right @ shares)) / count
-        masses = torch.stack([self._inside(change) for change in changes])
         moved = u + torch.einsum("k,kzyx->zyx", shares.float(), torch.stack(changes))
-        value, variance = float(self._inside(u) + masses @ shares), float(masses @ covariance @ masses)
-        return Told(value, variance * max(1.0, chi2), moved.clamp_min(problem.lower), limit)
+        value, variance = float(whole + masses @ shares), float(masses @ covariance @ masses)
+        return Told(value, variance * max(1.0, chi2), moved.clamp_min(self.problem.lower), limit)
 
     def misfit(self, u: Tensor, limit: float) -> float:
         """χ² of u by frequencies up to `limit`."""

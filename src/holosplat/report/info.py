@@ -13,7 +13,7 @@ from ..io.reading import Reading
 from ..memory import uncollected
 from ..units import beam_named, in_percent
 from ..workflows.choice import Choice
-from ..workflows.run_folder import RunFolder
+from ..workflows.run_folder import SERIES, RunFolder
 
 if TYPE_CHECKING:
     from ..planning.scan_facts import ScanFacts
@@ -50,7 +50,10 @@ def info(path: str | Path, reading: Reading = Reading(), picture: Path | None = 
         require_writable(picture)
     found = None
     try:
-        found = facts_of_run(RunFolder(path)) if RunFolder(path).config.is_file() else facts_of_matter(path)
+        if (path / SERIES).is_file():
+            found = facts_of_series(path)
+        else:
+            found = facts_of_run(RunFolder(path)) if RunFolder(path).config.is_file() else facts_of_matter(path)
         scan = _of_scan(path, reading) if found is None else None
     except InputError as error:
         found, scan = no_kind(path, error), None
@@ -74,6 +77,27 @@ def _of_scan(path: Path, reading: Reading) -> ScanFacts:
         from ..planning.scan_facts import facts_of_scan  # needs torch, which takes longer than all else
 
     return facts_of_scan(loader, path, reading)
+
+
+def facts_of_series(path: Path) -> Facts:
+    """The facts of a series. Errors: `InputError` for files that are damaged."""
+    with uncollected():
+        from ..workflows.motion_choice import begun_motion
+        from ..workflows.verdict import said_of_times
+
+    with as_written(path / SERIES, "the plan of a series"):
+        scans = [(str(one["path"]), len(one["times_s"])) for one in read_json(path / SERIES)["scans"]]
+    with as_written(path, "rows of a series"):
+        rows = {row["number"]: row for row in map(read_json, sorted(path.glob("tasks/*/*.row.json")))}
+        done = [row for _, row in sorted(rows.items()) if row["status"] == "done"]
+        judged = [(row["number"], bool(row["good"]), str(row["words"])) for row in done if row["good"] is not None]
+    chosen, count = begun_motion(path), sum(times for _, times in scans)
+    said = {"what": f"a series of {count} times", "made from": ", ".join(scan for scan, _ in scans)}
+    said |= {"state": f"{len(done)} of {count} times are done"}
+    said |= {"verdict": "; ".join(line.strip() for line in said_of_times(judged, count))} if judged else {}
+    said |= {"chosen": chosen.line} if chosen else {}
+    commands = (f"holosplat series collect {path}", f"holosplat export {path} --volume v.h5 --time-frame all")
+    return Facts(said, (), commands)
 
 
 def facts_of_run(folder: RunFolder) -> Facts:

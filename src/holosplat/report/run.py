@@ -27,8 +27,9 @@ from ..scan import Scan
 from ..tables import to_table
 from ..units import beam_named, span, wavenumber
 from ..volume import Volume
-from ..workflows.evaluate import Evaluation, of_absorption, render
+from ..workflows.evaluate import TIMES, Evaluation, lines_of_times, of_absorption, render
 from ..workflows.forecast import NUMBERS, flow_in_words, read_band
+from ..workflows.motion_choice import begun_motion
 from ..workflows.reconstruct import Reconstruction
 from ..workflows.rehearsal import read_rehearsal
 from ..workflows.run_folder import RunFolder
@@ -59,7 +60,9 @@ def report_run(
 
     remark: a sentence on what `scan` is a part of, which follows the summary of it.
     """
-    config, moving = folder.read_config(), None
+    config, moving, chosen = folder.read_config(), None, begun_motion(folder.path)
+    times = "; ".join(line.strip() for line in lines_of_times(folder.path / TIMES))
+    remark = " ".join(filter(None, (remark, times and f"Times: {times}.")))
     turned = found = reconstruction.object
     if isinstance(found, MovingSurfaces):
         moving = moving_of(reconstruction, scan, evaluation.light, read_errors(folder))
@@ -116,7 +119,7 @@ def report_run(
         moving=moving,
         guess=_guess(folder, reconstruction),
         forecast=_forecast(folder),
-        decisions=reconstruction.choice.decisions,
+        decisions=(*([chosen] if chosen else ()), *reconstruction.choice.decisions),
         view=view_of(turned, volume, truth, scan, reconstruction.delta_told),
         history=folder.history(),
         seconds=sum(reconstruction.timing.values()),

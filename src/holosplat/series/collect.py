@@ -14,6 +14,7 @@ from ..geometry import Grid
 from ..io.atomic import write_rows
 from ..io.objects import read_object
 from ..tables import number_in
+from ..workflows.motion_choice import begun_motion
 from ..workflows.run_folder import RunFolder
 from .events import EVENT_COLUMNS, FRONT_COLUMNS, PARTS, TRACK_COLUMNS, Front, History, Parts, front_rows
 from .folder import Body, Row, SeriesFolder, TaskState, plain, time_left
@@ -208,6 +209,6 @@ def page_of(folder: SeriesFolder, found: Collected) -> SeriesPage:
         for task, apart in found.agreement.items()
         if apart == apart
     ]
-    return SeriesPage(
-        "A series", headline(verdict, frames), f"{time_left(found.states)}.", tuple(frames), failed, tuple(notes)
-    )
+    chosen = begun_motion(folder.path)
+    summary = f"{time_left(found.states)}." + (f" {chosen.line.replace('-', '−')}." if chosen else "")
+    return SeriesPage("A series", headline(verdict, frames), summary, tuple(frames), failed, tuple(notes))

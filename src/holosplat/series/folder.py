@@ -16,6 +16,8 @@ from ..io.atomic import atomic_folder, read_json, require_new, write_json
 from ..io.leftovers import is_hidden
 from ..io.lock import Writer, writer_of
 from ..tables import from_table
+from ..workflows.run_folder import SERIES
+from ..workflows.verdict import said_of_times
 from .plan import SeriesPlan, Window, natural
 
 ROW = "row.json"
@@ -80,8 +82,6 @@ def read_row(path: Path) -> Row:
         return from_table(Row, values)
 
 
-MOST_TOLD = 5
-"""Verdicts told in full, at most."""
 LONGEST = 160
 """Characters of a reason in a table."""
 
@@ -115,21 +115,11 @@ def outcome_of(row: Row) -> str:
 
 def verdict_of(rows: Sequence[Row]) -> list[str]:
     """Which times are not explained, and why; how many are, where all are."""
-    judged = [row for row in rows if row.done and row.good is not None]
-    bad = [row for row in judged if not row.good]
-    if not bad:
-        return [f"the frames of {len(judged)} of {len(rows)} times are explained"]
-    said = f"the frames of {len(bad)} of {len(rows)} times are not explained, do not trust them: "
-    return [said + some([row.number for row in bad]), *(f"  time {row.number}: {row.words}" for row in bad[:MOST_TOLD])]
+    judged = [(row.number, row.good, row.words) for row in rows if row.done and row.good is not None]
+    return said_of_times(judged, len(rows))
 
 
-def some(numbers: Sequence[int], most: int = 12) -> str:
-    """The first of some numbers."""
-    shown = ", ".join(str(number) for number in numbers[:most])
-    return shown if len(numbers) <= most else f"{shown} …"
-
-
-PLAN, TASKS, DONE, FAILED = "series.json", "tasks", "done.json", "failed.json"
+PLAN, TASKS, DONE, FAILED = SERIES, "tasks", "done.json", "failed.json"
 State = Literal["done", "running", "failed", "left"]
 
 

@@ -24,8 +24,8 @@ from ..units import in_percent, two_digits
 from ..units import plain as in_digits
 from ..workflows.next_step import next_step
 from ..workflows.run_folder import RunFolder
-from ..workflows.verdict import Verdict
-from .folder import Row, plain, some
+from ..workflows.verdict import Verdict, some
+from .folder import Row, plain
 
 MOST_PICTURES = 160
 """Times whose phase map a page holds, at most: evenly chosen, about 8 kB each."""
@@ -110,7 +110,9 @@ def headline(state: str, frames: Sequence[Frame]) -> Headline:
     """Whether the frames of all times are explained, or why not and what to try next; `state`: what is done."""
     bad = [frame for frame in frames if frame.row.good is False]
     if not bad:
-        return Headline(state, True if any(frame.row.good for frame in frames) else None, ())
+        good = sum(frame.row.good is True for frame in frames)
+        said = f"The frames of {good} of {len(frames)} times are explained"
+        return Headline(said, True, (state,)) if good else Headline(state, None, ())
     numbers = some([frame.row.number for frame in bad])
     said = f"The frames of {len(bad)} are not explained: {numbers}."
     text = f"Do not trust {len(bad)} of {len(frames)} times: their frames are not explained"

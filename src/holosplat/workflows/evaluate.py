@@ -10,9 +10,10 @@ import numpy as np
 import torch
 
 from ..backends import resolve
-from ..checks import require
+from ..checks import as_written, require
 from ..fit.residuals import Prediction
 from ..geometry import Grid, Views
+from ..io.atomic import write_rows
 from ..matter import DeltaBeta
 from ..metrics import ImageScores, VolumeScores, image_scores, intensity_range, volume_scores
 from ..metrics.images import json_number
@@ -20,10 +21,11 @@ from ..model import Instrument, Model
 from ..optics.background import Light
 from ..representations import Stored
 from ..scan import Exposures, Scan
+from ..tables import read_rows
 from ..volume import Object, Volume
 from .reconstruct import Reconstruction
 from .run_illumination import light_of
-from .verdict import Verdict, judge
+from .verdict import Verdict, judge, said_of_times
 
 OTHER_FIELD = 8.0
 """A truth so many times larger or smaller than the frames is of another field."""
@@ -220,6 +222,34 @@ def held_out_verdict(reconstruction: Reconstruction, scan: Scan, lit: Light | No
         whole = replace(scan, frames=lit.evened(torch.from_numpy(scan.frames)).numpy())
         test, noise = whole.test(), lit.doubt[np.flatnonzero(scan.is_test)]
     return judge(Prediction(found, test.exposures, reconstruction.oversample, backend=found.backend), test, noise)
+
+
+TIMES = "times.csv"
+"""What a run of several times says of each one."""
+
+
+def write_times(path: Path, reconstruction: Reconstruction, scan: Scan, lit: Light | None = None) -> None:
+    """Write whether the training frames of each time of `scan` are explained, a row each; lit: as above."""
+    found, doubt = _where_it_is_judged(reconstruction), None
+    if lit is not None:
+        scan, doubt = replace(scan, frames=lit.evened(torch.from_numpy(scan.frames)).numpy()), lit.doubt
+    rows = []
+    for number, time in enumerate(scan.train().instants):
+        own = np.flatnonzero((scan.exposures.time == time) & ~scan.is_test)
+        said = Prediction(found, scan.exposures[own], reconstruction.oversample, backend=found.backend)
+        verdict = judge(said, scan[own], doubt and doubt[torch.from_numpy(own)])
+        rows.append((number, f"{time:.9g}", int(verdict.good), verdict.words))
+    write_rows(path, ("number", "time_s", "explained", "verdict"), rows)
+
+
+def lines_of_times(path: Path) -> list[str]:
+    """What `write_times` wrote, as lines of text; none where there is no such file."""
+    if not path.is_file():
+        return []
+    with as_written(path, "what reconstruct wrote"):
+        rows = read_rows(path, "what reconstruct wrote")
+        judged = [(int(row["number"]), bool(int(row["explained"])), row["verdict"]) for row in rows]
+    return said_of_times(judged, len(rows))
 
 
 def of_absorption(volume: Volume) -> Volume:

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import cache
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import torch
 
-from ..checks import InputError, require
+from ..checks import InputError, as_written, require
 from ..inference import Decision, Score, select
+from ..io.provenance import NAME, records
 from ..matter import MaterialPrior, MatterKind
 from ..methods import Auto, Method
 from ..methods.cross_validation import predicted_frames
 from ..motion.timed_frames import merged
 from ..optics.background import LightOptions
+from ..progress import FitProgress
 from ..scan import Scan
 from ..volume import Object
 from .reconstruct import reconstruct
@@ -38,6 +41,7 @@ def choose_motion(
     *,
     light: LightOptions | None = None,
     matter: MatterKind | None = None,
+    on_progress: FitProgress = lambda stage, fraction, record: None,
 ) -> Decision:
     """Whether each time is best taken by itself, or all as still matter, as matter that a flow carries, or as bodies.
 
@@ -46,19 +50,29 @@ def choose_motion(
     that it has not seen better than they themselves do. Errors: `InputError` for few times, and for times of one frame.
     """
 
-    def alone(part: Scan) -> Object:
-        return reconstruct(part, prior, method, seed, light=light, matter=matter).object
+    def of(way: str) -> FitProgress:
+        return lambda stage, fraction, record: on_progress(f"{MOTION}, {way}: {stage}", fraction, record)
+
+    def alone(part: Scan, way: str = "a time by itself") -> Object:
+        return reconstruct(part, prior, method, seed, light=light, matter=matter, on_progress=of(way)).object
 
     def carried(part: Scan) -> Object | None:
-        found = reconstruct_moving(part, prior, seed=seed, light=light)
+        found = reconstruct_moving(part, prior, seed=seed, light=light, on_progress=of("flow"))
         return None if found is None else found.reconstruction.object
 
     ways: Mapping[str, Way] = {
-        "still": lambda part: alone(merged(part)),
+        "still": lambda part: alone(merged(part), "still"),
         "flow": carried,
-        "bodies": lambda part: track(part, prior, seed=seed, light=light).object,
+        "bodies": lambda part: track(part, prior, seed=seed, light=light, on_progress=of("bodies")).object,
     }
     return decide(scan.train(), alone, ways)
+
+
+def begun_motion(folder: Path) -> Decision | None:
+    """What the `--motion auto` that began a folder has decided; None where none did."""
+    said = next((each["decided"][MOTION] for each in records(folder) if MOTION in each.get("decided", {})), None)
+    with as_written(folder / NAME):
+        return None if said is None else Decision.from_dict(said)
 
 
 def decide(train: Scan, alone: Way, ways: Mapping[str, Way]) -> Decision:

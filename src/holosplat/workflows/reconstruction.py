@@ -212,6 +212,7 @@ def read_rest(folder: RunFolder, found: Stored, config: dict[str, Any]) -> Rest 
 
 def instants_of(folder: RunFolder) -> list[float]:
     """The times [s] of the frames that a run in motion was fitted to; empty for one that stands still."""
+    folder.require_run()
     with as_written(folder.summary, "what track wrote"):
         return [float(time) for time in read_json(folder.summary).get("times_s", ())]
 

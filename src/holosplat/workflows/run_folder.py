@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 ROWS = 64
 """Rows of a dataset that are read at a time."""
+SERIES = "series.json"
+"""What tells the folder of a series."""
 OBJECT_SUM = "object_sha256"
 """The entry of summary.json that says what the object's file was."""
 
@@ -90,6 +92,8 @@ class RunFolder:
         require(self.path.is_dir(), f"the run folder {self.path} does not exist; check the path.")
         found = self.config.is_file() and self.result().is_file()
         hint = "; it was cut off, finish it with --resume" if self.config.is_file() else ""
+        if (self.path / SERIES).is_file():
+            hint = "; it is a series, each time of which has a run folder in tasks/, as tasks/0000/t0000: name that"
         require(found, f"{self.path} must hold a reconstruction (config.json, object.h5), but it does not{hint}.")
 
     def result(self) -> Path:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -168,6 +168,27 @@ def _noise(frames: torch.Tensor) -> NoiseModel:
     if min(shape) < FEWEST_ROWS:
         return NoiseModel.white_only(noise_levels(frames), shape)
     return NoiseModel.of_frames(frames)
+
+
+MOST_TOLD, MOST_NUMBERS = 5, 12
+"""Unexplained times of which a terminal says why, and which are named, at most."""
+
+
+def said_of_times(judged: Sequence[tuple[int, bool, str]], count: int) -> list[str]:
+    """Which of `count` times are not explained, and why; how many are, where all are. judged: number, whether its
+    frames are explained, and why, of each time of which that is known."""
+    bad = [(number, words) for number, good, words in judged if not good]
+    if not bad:
+        return [f"the frames of {len(judged)} of {count} times are explained"]
+    said = f"the frames of {len(bad)} of {count} times are not explained, do not trust them: "
+    why = (f"  time {number}: {words}" for number, words in bad[:MOST_TOLD])
+    return [said + some([number for number, _ in bad]), *why]
+
+
+def some(numbers: Sequence[int]) -> str:
+    """The first of some numbers."""
+    shown = ", ".join(str(number) for number in numbers[:MOST_NUMBERS])
+    return shown if len(numbers) <= MOST_NUMBERS else f"{shown} …"
 
 
 def judge_run(found: Stored, fit: Running | None, task: Task, oversample: int) -> Verdict:

@@ -8,8 +8,10 @@ the line integrals and, on request, of the distances and of the widths of the po
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -19,6 +21,9 @@ from ...backends import implementation
 from ...checks import require
 from ...units import wavelength
 from ..propagation import angular_spectrum_factor, fresnel_factors, gaussian_factors, needs_angular_spectrum
+
+SMALL, KEPT = 1 << 20, 8
+"""Samples of factors that are kept, at most, and how many: the verdict's views share them, and times of a series."""
 
 Refraction = Sequence[tuple[float, float]] | np.ndarray | Tensor
 """`(k δ, k β)` of each channel of matter per unit of its line integral: [C, 2] for all views, or [V, C, 2]."""
@@ -164,12 +169,25 @@ def optical_path(
         exact = needs_angular_spectrum(raster, pitch, lam.cpu().numpy(), z.detach().cpu().numpy())
     beyond = which = None
     if exact:
-        pairs, which = torch.stack((lam, z.detach()), dim=1), torch.arange(len(z), device=on)
-        if not isinstance(distance, Tensor):
-            pairs, which = torch.unique(pairs, dim=0, return_inverse=True)
-        way = z if isinstance(distance, Tensor) else pairs[:, 1]
-        beyond = angular_spectrum_factor(raster, pitch, pairs[:, 0], way, complex_dtype)
+        if isinstance(distance, Tensor):
+            which = torch.arange(len(z), device=on)
+            beyond = angular_spectrum_factor(raster, pitch, lam, z, complex_dtype)
+        else:
+            pairs, which = torch.unique(torch.stack((lam, z), dim=1), dim=0, return_inverse=True)
+            known = _kept if len(pairs) * math.prod(raster) <= SMALL else _known_factor
+            beyond = known(raster, pitch, tuple(map(tuple, pairs.tolist())), complex_dtype).to(on)
     return OpticalPath(rows, columns, *blurs, lam, alike, *frame, pitch, beyond, which)
+
+
+def _known_factor(
+    raster: tuple[int, int], pitch: float, pairs: tuple[tuple[float, float], ...], dtype: torch.dtype
+) -> Tensor:
+    """`angular_spectrum_factor` of pairs of wavelength and distance; nobody writes to it."""
+    lam, z = torch.tensor(pairs, dtype=torch.float64).unbind(1)
+    return angular_spectrum_factor(raster, pitch, lam, z, dtype)
+
+
+_kept = lru_cache(maxsize=KEPT)(_known_factor)
 
 
 def _numbers(given: np.ndarray | Tensor, on: torch.device) -> Tensor:
