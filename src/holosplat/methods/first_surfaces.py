@@ -248,7 +248,10 @@ def with_missing_bodies(
         except InputError:  # none has the volume of a voxel
             break
         more = settled(task, _of_bodies([found.mesh(), bodies.mesh()], found), surfaces, how)
-        more = _of_bodies([body for body in more.bodies() if body.volume >= more.unit_length**3], more)
+        lasting = [body for body in more.bodies() if body.volume >= more.unit_length**3]
+        if not lasting:
+            break
+        more = _of_bodies(lasting, more)
         if (left_over := _left(task, more, surfaces)) >= least:
             break
         best, least = (level, more), left_over

@@ -99,7 +99,7 @@ class BodiesStage(GaussianStage):
     def best_cut(self, task: Task, cloud: GaussianCloud, cut: Cut) -> SurfaceMesh:
         """The surfaces that `cut` gets out of `cloud`; or, if they explain more by the policy of `select`, of small
         frames those of a first volume, where there are any, and, where much matter is missing from the first after some
-        steps, those cut on finer voxels. Bodies that are missing from them join them (`_with_missing_bodies`).
+        steps, those cut on finer voxels. Of small frames bodies that are missing join them (`_with_missing_bodies`).
 
         Marching cubes at one half leave out what is not much thicker than their voxels, and surfaces that are missing
         do not grow. Errors: those of `cut`, where there are no others.
@@ -116,14 +116,18 @@ class BodiesStage(GaussianStage):
             if not found:
                 raise
             return found["of a volume"]
+        lacking, small = bool(found) or self._missing(first, task) > most, self._small(task)
+        if not (lacking or small):
+            return first
         own = settled(seen, first, self.surfaces, steps)
-        if found or self._missing(first, task) > most:
+        if lacking:
             if self._missing(own, task) > most:
                 found["on finer voxels"] = settled(seen, cut(self.surfaces.extraction.finer()), self.surfaces, steps)
             chosen = self._chosen({"of Gaussians": own, **found}, seen)
             if chosen is not own or "of a volume" in found:
                 first = own = chosen
-        return self._with_missing_bodies(seen, own, steps) or first
+        more = self._with_missing_bodies(seen, own, steps) if small else None
+        return more or first
 
     def _chosen(self, found: Mapping[str, SurfaceMesh], task: Task) -> SurfaceMesh:
         """The surfaces that explain most of the frames by the policy of `select`, the null first."""
@@ -134,7 +138,6 @@ class BodiesStage(GaussianStage):
     def _with_missing_bodies(self, task: Task, found: SurfaceMesh, steps: CoarseToFine) -> SurfaceMesh | None:
         """`found` and bodies missing from it, if these explain more of the training frames, and then of views that
         were set aside from both; else None. Training frames alone may prefer bodies that make up for noise."""
-
         own = settled(task, found, self.surfaces, steps)
         joined = with_missing_bodies(task, found, self.surfaces, steps)
         if joined is None or self._chosen({"as found": own, MORE: joined[1]}, task) is own:
