@@ -22,14 +22,14 @@ from holosplat.matter import MaterialPrior, Matter
 from holosplat.mesh import TriangleMesh
 from holosplat.methods import Gaussians, SurfaceOptions, Surfaces, Task
 from holosplat.methods.coarse import CoarseToFine, Way, begun_surfaces, first_of, missing_matter, settled
-from holosplat.methods.cross_validation import BY_VIEWS
+from holosplat.methods.cross_validation import BY_FISSION, BY_VIEWS
 from holosplat.methods.first_surfaces import first_surfaces, is_noisy, surfaces_of_volume, with_missing_bodies
 from holosplat.methods.gaussian_options import FitOptions
 from holosplat.methods.illumination import prepared
 from holosplat.methods.method import quiet
 from holosplat.methods.start import cloud_of_surfaces
 from holosplat.methods.surface_fit import FINEST, Extraction, SurfaceFit, extract_surfaces
-from holosplat.methods.surfaces import MORE, BodiesStage
+from holosplat.methods.surfaces import BODIES, MORE, BodiesStage
 from holosplat.optics.background import LightOptions
 from holosplat.representations import SurfaceMesh
 from holosplat.scan import Exposures
@@ -243,7 +243,7 @@ def test_a_body_that_is_missing_joins(noisy, monkeypatch):
     cells = [body for body in found.bodies() if body.volume > 0.3 * CELLS[3].volume]
     assert len(cells) == 4
     assert error(found) < 0.5 * error(mesh_of(3))
-    assert (told[-1].name, told[-1].choice, told[-1].by) == ("surfaces", MORE, BY_VIEWS)
+    assert (told[-1].name, told[-1].choice, told[-1].by) == (BODIES, MORE, BY_VIEWS)
 
 
 def test_where_none_is_missing_none_joins(noisy):
@@ -267,13 +267,40 @@ def test_a_body_that_unseen_views_do_not_show_does_not_join(noisy, monkeypatch):
 
 
 def test_what_is_too_much_is_not_made_up_for_elsewhere(noisy):
-    """Beside surfaces of half as much matter again, whose residual is of both signs, no body is added that lasts."""
-    wide = mesh_of()
-    grown = [(body.vertices - body.vertices.mean(0)) * 1.15 + body.vertices.mean(0) for body in wide.bodies()]
-    large = surfaces(*(replace(body, vertices=at) for body, at in zip(wide.bodies(), grown)), unit=PITCH)
-    assert error(large) > 0.3
+    """Beside bodies that are 1.15 times as large, whose residual is of both signs, additions alone are worse."""
+    grown = [(body.vertices - body.vertices.mean(0)) * 1.15 + body.vertices.mean(0) for body in mesh_of().bodies()]
+    bodies = zip(mesh_of().bodies(), grown)
+    large = surfaces(*(replace(body, vertices=at / PITCH) for body, at in bodies), unit=PITCH)
+    assert 0.4 < error(large) < 0.8
     made = with_missing_bodies(noisy, large, HOW, OPTIONS.coarse)
     assert made is None or error(made[1]) < 1.02 * error(settled(noisy, large, HOW, OPTIONS.coarse))
+
+
+def test_where_no_body_keeps_a_voxel_there_are_none(noisy, monkeypatch):
+    small = surfaces(bumpy(1, 0.4), unit=PITCH)
+    monkeypatch.setattr("holosplat.methods.first_surfaces.settled", lambda *given: small)
+    assert with_missing_bodies(noisy, mesh_of(3), HOW, OPTIONS.coarse) is None
+    inside_out = SurfaceMesh(small.vertices, small.faces.flip(1), PITCH, small.matter)
+    monkeypatch.setattr("holosplat.methods.first_surfaces.settled", lambda *given: inside_out)
+    assert with_missing_bodies(noisy, mesh_of(3), HOW, OPTIONS.coarse) is None
+
+
+def test_two_views_are_judged_by_data_fission(noisy, monkeypatch):
+    """Both halves of their noise are of all views: one is fitted, and the other predicted."""
+    monkeypatch.setattr("holosplat.methods.surfaces.begun_surfaces", lambda *given: None)
+    monkeypatch.setattr("holosplat.methods.surfaces.with_missing_bodies", lambda *given: (0.2, mesh_of(4)))
+    told = list[Decision]()
+    task = replace(noisy.of_views(np.array([0, 4])), on_start=lambda decision, guess: told.append(decision))
+    found, _ = best_cut(task, 2)
+    assert (told[-1].name, told[-1].choice, told[-1].by) == (BODIES, MORE, BY_FISSION)
+    assert torch.equal(found.vertices, mesh_of(4).vertices)
+
+
+def test_large_frames_get_none(noisy, monkeypatch):
+    monkeypatch.setattr("holosplat.methods.surfaces.with_missing_bodies", lambda *given: pytest.fail("not asked for"))
+    monkeypatch.setattr(BodiesStage, "_small", lambda *given: False)
+    found, _ = best_cut(noisy, 4)
+    assert torch.equal(found.vertices, mesh_of().vertices)
 
 
 def test_bodies_of_several_materials_get_none(noisy):
@@ -338,3 +365,15 @@ def test_a_run_ends_with_them(noisy):
     found = reconstruct(noisy.scan, noisy.prior, Surfaces(fit=HOW.fit, gaussians=OPTIONS), matter="levels")
     assert isinstance(found.object, SurfaceMesh)
     assert error(found.object) < 0.25
+
+
+@pytest.mark.usefixtures("unjudged_runs")
+def test_a_run_keeps_the_last_decision_of_each_name(noisy, monkeypatch):
+    """Training frames ask for the body that is missing, and views set aside confirm it."""
+    monkeypatch.setattr("holosplat.methods.surfaces.begun_surfaces", lambda *given: None)
+    monkeypatch.setattr("holosplat.methods.surfaces.extract_surfaces", lambda *given: mesh_of(2))
+    monkeypatch.setattr("holosplat.methods.surfaces.with_missing_bodies", lambda *given: (0.2, mesh_of(4)))
+    found = reconstruct(noisy.scan, noisy.prior, Surfaces(fit=HOW.fit, gaussians=OPTIONS), matter="levels")
+    made = [(each.choice, each.by) for each in found.choice.decisions if each.name == BODIES]
+    assert made == [(MORE, BY_VIEWS)]
+    assert sum(each.name == "surfaces" for each in found.choice.decisions) == 1

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..baselines import holographic_tv
 from ..baselines.algebraic import Algebraic, sirt
-from ..baselines.holographic_tv import Correction, agreed
+from ..baselines.holographic_tv import Correction, agreed, correlated
 from ..baselines.two_materials import Shares, at_one_ratio
 from ..checks import InputError, require
 from ..geometry import Grid
@@ -229,15 +229,15 @@ def with_missing_bodies(
 
     The thickness that explains what `found` leaves of the frames (`Correction`) changes its occupancy within 0 and 1,
     by SIRT: what is too much is taken away where it is, and is not made up for by matter elsewhere. Where occupancy
-    is added, a body is missing; it has at least the volume of a voxel, in the end, too. Few views and noise make it
-    faint, so that `levels`, from the lowest on as long as less of the frames is left, are shares of the largest
-    addition.
+    is added, a body is missing; it has at least the volume of a voxel, and bodies with less after the steps are left
+    out. Few views and noise make it faint, so that `levels`, from the lowest on as long as less of the frames is left,
+    are shares of the largest addition.
     """
     if not found.matter.single:
         return None
     matter, grid = DeltaBeta(found.matter.delta, found.matter.beta), Grid.of_views(task.scan.views)
     left = task.scan.left(frames_of(found, task.scan, surfaces.fit))
-    lines, shares = Correction(task.scan, matter, noise=task.noise)(left), found.shares(grid)[0].float().cpu()
+    lines, shares = Correction(task.scan, matter, noise=correlated(task.lit))(left), found.shares(grid)[0].float().cpu()
     kept = {"options": Algebraic(nonnegative=True), "missing": task.scan.gaps, "start": shares}
     added = sirt(lines, task.scan.views, grid, 1.0, partial(task.on_progress, MISSING), **kept) - shares
     best, least, largest = None, math.inf, float(added.max())
@@ -245,10 +245,10 @@ def with_missing_bodies(
         every = replace(surfaces.extraction, level=level, least_volume=1.0)
         try:
             bodies = cut_surfaces(added / largest, grid, task.scan.views.finest, found.matter, every)
-        except InputError:  # none has the volume of a voxel
+            more = settled(task, _of_bodies([found.mesh(), bodies.mesh()], found), surfaces, how)
+            lasting = [body for body in more.bodies() if body.volume >= more.unit_length**3]
+        except InputError:  # none has the volume of a voxel, or none is left
             break
-        more = settled(task, _of_bodies([found.mesh(), bodies.mesh()], found), surfaces, how)
-        lasting = [body for body in more.bodies() if body.volume >= more.unit_length**3]
         if not lasting:
             break
         more = _of_bodies(lasting, more)

@@ -67,7 +67,7 @@ class Surfaces(SurfaceOptions, Method):
         return replace(super().with_effort(effort), gaussians=self.gaussians.with_effort(effort))
 
 
-MORE = "with missing bodies"
+BODIES, AS_FOUND, MORE = "missing bodies", "as found", "with missing bodies"
 
 
 @dataclass(frozen=True)
@@ -123,26 +123,32 @@ class BodiesStage(GaussianStage):
         if lacking:
             if self._missing(own, task) > most:
                 found["on finer voxels"] = settled(seen, cut(self.surfaces.extraction.finer()), self.surfaces, steps)
-            chosen = self._chosen({"of Gaussians": own, **found}, seen)
+            chosen = self._chosen("surfaces", {"of Gaussians": own, **found}, seen)
             if chosen is not own or "of a volume" in found:
                 first = own = chosen
         more = self._with_missing_bodies(seen, own, steps) if small else None
         return more or first
 
-    def _chosen(self, found: Mapping[str, SurfaceMesh], task: Task) -> SurfaceMesh:
+    def _chosen(self, name: str, found: Mapping[str, SurfaceMesh], task: Task) -> SurfaceMesh:
         """The surfaces that explain most of the frames by the policy of `select`, the null first."""
-        decision = select("surfaces", tuple(found), lambda name, _: self._score(found[name], task), by=BY)
+        decision = select(name, tuple(found), lambda one, _: self._score(found[one], task), by=BY)
         task.on_start(decision, None)
         return found[decision.choice]
 
     def _with_missing_bodies(self, task: Task, found: SurfaceMesh, steps: CoarseToFine) -> SurfaceMesh | None:
-        """`found` and bodies missing from it, if these explain more of the training frames, and then of views that
-        were set aside from both; else None. Training frames alone may prefer bodies that make up for noise."""
-        own = settled(task, found, self.surfaces, steps)
+        """`found` and bodies missing from it, if these explain more of the training frames than as many steps without
+        them, and then more of views that are set aside; else None.
+
+        Training frames alone may prefer bodies that make up for noise. In each fold both begin with `found`, which has
+        seen all views, and bodies are sought in the others alone.
+        """
         joined = with_missing_bodies(task, found, self.surfaces, steps)
-        if joined is None or self._chosen({"as found": own, MORE: joined[1]}, task) is own:
+        if joined is None:
             return None
-        folds, (level, more) = Folds.of(task.scan, binning=1), joined
+        (level, more), own = joined, settled(task, found, self.surfaces, steps)
+        if self._chosen(BODIES, {AS_FOUND: own, MORE: more}, task) is own:
+            return None
+        folds = Folds.of(task.scan, binning=1)
 
         @cache
         def scores(fold: int) -> dict[str, Score]:
@@ -150,14 +156,10 @@ class BodiesStage(GaussianStage):
             part = replace(task.of_views(folds.kept(fold)), scan=seen)
             null = settled(part, found, self.surfaces, steps)
             _, other = with_missing_bodies(part, found, self.surfaces, steps, (level,)) or (level, null)
-            return {
-                name: self._score(each, replace(task, scan=unseen))
-                for name, each in (("as found", null), (MORE, other))
-            }
+            both = {AS_FOUND: null, MORE: other}
+            return {name: self._score(each, replace(task, scan=unseen)) for name, each in both.items()}
 
-        decision = select(
-            "surfaces", ("as found", MORE), lambda name, fold: scores(fold)[name], folds.count, by=folds.by
-        )
+        decision = select(BODIES, (AS_FOUND, MORE), lambda name, fold: scores(fold)[name], folds.count, by=folds.by)
         task.on_start(decision, None)
         return more if decision.choice == MORE else None
 

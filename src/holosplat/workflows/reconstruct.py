@@ -241,8 +241,9 @@ class _FolderRun(Run):
         return both
 
     def start_at(self, decision: Decision, guess: GuessedMatter | None) -> None:
-        """Take in what a fit starts from."""
-        self.start, self._guess = (*self.start, decision), guess or self._guess
+        """Take in what a fit starts from, in place of what was decided of it before."""
+        others = (each for each in self.start if each.name != decision.name)
+        self.start, self._guess = (*others, decision), guess or self._guess
 
     def make_folder(self, backend: str) -> None:
         """Make the folder, once there is something to put in it."""
