@@ -365,15 +365,3 @@ def test_a_run_ends_with_them(noisy):
     found = reconstruct(noisy.scan, noisy.prior, Surfaces(fit=HOW.fit, gaussians=OPTIONS), matter="levels")
     assert isinstance(found.object, SurfaceMesh)
     assert error(found.object) < 0.25
-
-
-@pytest.mark.usefixtures("unjudged_runs")
-def test_a_run_keeps_the_last_decision_of_each_name(noisy, monkeypatch):
-    """Training frames ask for the body that is missing, and views set aside confirm it."""
-    monkeypatch.setattr("holosplat.methods.surfaces.begun_surfaces", lambda *given: None)
-    monkeypatch.setattr("holosplat.methods.surfaces.extract_surfaces", lambda *given: mesh_of(2))
-    monkeypatch.setattr("holosplat.methods.surfaces.with_missing_bodies", lambda *given: (0.2, mesh_of(4)))
-    found = reconstruct(noisy.scan, noisy.prior, Surfaces(fit=HOW.fit, gaussians=OPTIONS), matter="levels")
-    made = [(each.choice, each.by) for each in found.choice.decisions if each.name == BODIES]
-    assert made == [(MORE, BY_VIEWS)]
-    assert sum(each.name == "surfaces" for each in found.choice.decisions) == 1

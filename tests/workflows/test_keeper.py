@@ -16,6 +16,7 @@ from holosplat.inference import Compared, Decision
 from holosplat.io.atomic import read_json
 from holosplat.matter import MaterialPrior
 from holosplat.methods import GaussianRates, SmoothVolume, solve
+from holosplat.methods.gaussians import GaussianStage
 from holosplat.methods.keeper import Keeper
 from holosplat.methods.method import Task
 from holosplat.representations import GaussianCloud, VoxelGrid
@@ -73,6 +74,21 @@ def test_what_was_kept_survives_a_resume(scan, tmp_path):
     assert first.choice.kept == ""
     done = reconstruct(scan, KNOWN, RUINOUS, matter="levels", folder=folder, resume=True)
     assert done.choice == whole.choice
+
+
+def test_a_run_keeps_the_last_decision_of_each_name(scan, monkeypatch):
+    """Where a stage starts may be decided in steps, the last of which is what holds."""
+    own = GaussianStage.own_start
+
+    def start(stage: GaussianStage, task: Task):
+        for name, choice in (("bodies", "some"), ("surfaces", "these"), ("bodies", "none")):
+            task.on_start(Decision(name, choice, "a test"), None)
+        return own(stage, task)
+
+    monkeypatch.setattr(GaussianStage, "own_start", start)
+    done = reconstruct(scan, KNOWN, SMALL, matter="levels")
+    told = [(each.name, each.choice) for each in done.choice.decisions if each.by == "a test"]
+    assert told == [("surfaces", "these"), ("bodies", "none")]
 
 
 def test_a_slightly_worse_share_may_be_noise(scan):
