@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -153,7 +154,10 @@ def test_the_command_takes_what_was_chosen_says_of_each_time_and_goes_on(asked, 
     text = (tmp_path / "out" / page).read_text(encoding="utf-8")
     assert "times set aside" in text
     if motion == "still":
-        assert f"of {TIMES} times are " in text
+        assert f"of {TIMES} times are not explained" in text
+        (said,) = re.findall("Times: [^<]*", text)
+        assert ".." not in said
+        assert ".;" not in said
     else:
         worked(command("export", tmp_path / "out", "--volume", tmp_path / "v.h5", "--time-frame", "all"))
         last = tmp_path / "out" / "tasks" / "0000" / f"t{TIMES - 1:04d}"
