@@ -77,8 +77,8 @@ def may_flow(method: Method, matter: MatterKind | None) -> bool:
 
 def motion_of(decision: Decision) -> Motion:
     """The way that a decision took. Errors: `InputError` for one of something else."""
-    known: tuple[Motion, ...] = get_args(Motion)
-    found = next((each for each in known if each == decision.choice), None)
+    known: dict[str, Motion] = {each: each for each in get_args(Motion)}
+    found = known.get(decision.choice)
     if found is None:
         raise InputError(f"the motion must be one of {', '.join(known)}, but it is {decision.choice[:40]!r}.")
     return found
