@@ -37,9 +37,10 @@ TIMES, LONGEST = 6, 3000.0
 
 @dataclass(frozen=True)
 class Row:
-    """One time of a scene. choice, gains: of the motion, and each way's smaller residual of unseen frames [%] with its
-    standard error; error, each_error: of δ, by auto and by each time by itself; explained, each_explained: 1 where the
-    frames of this time are; seconds: of the processor, of all times with the decision."""
+    """One time of a scene. choice, gains: of the motion, and for each way 100 times the logarithm of the ratio of
+    residuals of unseen frames, that of the best before over its own, with its standard error; error, each_error: of δ,
+    by auto and by each time by itself; explained, each_explained: 1 where the frames of this time are; seconds: of the
+    processor, of all times with the decision."""
 
     scene: str
     pixels: int

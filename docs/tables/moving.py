@@ -123,7 +123,8 @@ def chosen_motion() -> str:
         explained = [f"{sum(r[key] == '1' for r in own)} of {len(own)}" for key in ("explained", "each_explained")]
         told = (own[0]["choice"], own[0]["gains"].replace("-", "−"), *errors, *explained)
         lines.append([f"{name}, {own[0]['pixels']} px", *told, f"{float(own[0]['seconds']):.0f} s"])
-    columns = ("scene", "taken", "smaller residual of frames set aside, %", "error of δ", "by `each`")
+    gains = "logarithm of the ratio of residuals of frames set aside × 100"
+    columns = ("scene", "taken", gains, "error of δ", "by `each`")
     return markdown((*columns, "explained", "by `each`", "processor time"), lines)
 
 

@@ -19,6 +19,7 @@ from holosplat.methods import SmoothVolume
 from holosplat.motion.flow_reconstruction import FlowOptions
 from holosplat.optics.background import LightOptions
 from holosplat.representations import MovingGaussians, SpaceTimeField
+from holosplat.tables import read_rows
 from holosplat.workflows.reconstruct import load_reconstruction
 from holosplat.workflows.run_folder import RunFolder
 from holosplat.workflows.track import reconstruct_moving
@@ -66,6 +67,10 @@ def test_a_series_in_motion_is_one_object_that_all_commands_read(quick):
     assert "time 1000 µs, of 9 frames of 3 times" in (quick / "remark").read_text(encoding="utf-8")
     summary = json.loads((quick / "run/summary.json").read_text())
     assert summary["times_s"] == pytest.approx([0, 1e-3, 2e-3], abs=0)
+    rows = read_rows(quick / "run/times.csv", "")
+    assert [float(row["time_s"]) for row in rows] == pytest.approx([0, 1e-3, 2e-3], abs=0)
+    assert {row["explained"] for row in rows} <= {"0", "1"}
+    assert "of 3 times are " in said.out
     worked(holosplat("export", quick / "run", "--volume", quick / "v.h5", "--time-frame", "all"))
     volumes = [read_volume(quick / f"v_t000{k}.h5").delta for k in range(3)]
     assert np.abs(volumes[2] - volumes[0]).max() > 0.01 * volumes[0].max()

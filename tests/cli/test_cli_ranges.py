@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from helpers.blobs import MATERIAL, blob_scan
@@ -12,6 +14,7 @@ from holosplat.baselines import HolographicTV
 from holosplat.io.nxtomo import write_scan
 from holosplat.methods import uncertain
 from holosplat.methods.profile import ProfileOptions
+from holosplat.tables import read_rows
 
 pytestmark = pytest.mark.usefixtures("unjudged_runs")
 
@@ -42,6 +45,17 @@ def test_a_range_of_distances_is_fitted_kept_and_used(scan, tmp_path):
     assert source["reading"]["distance"] == pytest.approx(constant["value"])
     again = worked(holosplat("evaluate", run, "--json"))
     assert "not the scan that was reconstructed" not in again.err
+
+
+def test_times_of_a_range_are_judged_in_the_end(scan, tmp_path):
+    """Of all times as one: each is read again, with the distance that was found."""
+    once = blob_scan(0.12)
+    write_scan(tmp_path / "times.nxs", replace(once, exposures=replace(once.exposures, time=np.repeat([0.0, 1e-3], 3))))
+    said = ("--distance", "0.06:0.2", "--delta-beta", MATERIAL.ratio, "--motion", "still")
+    worked(holosplat("reconstruct", tmp_path / "times.nxs", "--out", tmp_path / "run", *METHOD, *said))
+    rows = read_rows(tmp_path / "run" / "times.csv", "")
+    assert [float(row["time_s"]) for row in rows] == [0.0, 1e-3]
+    assert (tmp_path / "run" / "report.html").is_file()
 
 
 def test_a_range_of_ratios_is_a_ratio_then(scan, tmp_path):

@@ -60,7 +60,12 @@ def test_a_run_has_its_bodies_and_tracks(folder):
     assert summary["times_s"] == pytest.approx(STEP * np.arange(TIMES))
     assert summary["kind"] == "moving-surfaces"
     assert summary["decided"]["begun"].startswith("bodies at single times: tomography (")
-    assert (run / "report.html").is_file()
+    with (run / "times.csv").open() as file:
+        times = list(csv.DictReader(file))
+    assert [float(row["time_s"]) for row in times] == pytest.approx(STEP * np.arange(TIMES))
+    assert all(row["verdict"] and row["explained"] in {"0", "1"} for row in times)
+    page = (run / "report.html").read_text(encoding="utf-8")
+    assert f"of {TIMES} times are " in page
 
 
 def test_rows_have_standard_errors(folder):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from holosplat.checks import InputError
 from holosplat.inference import Decision
 from holosplat.io.nxtomo import write_scan
 from holosplat.io.volumes import read_volume
+from holosplat.methods import Auto
 from holosplat.specimens.phantoms import Ball
 from holosplat.specimens.red_cells import random_cells
 from holosplat.specimens.scene import MeshScene
@@ -73,14 +76,48 @@ def truth() -> MeshScene:
     return MeshScene.of_one_material(cells, CELL).moved(2.5 * PIXEL * np.array([0.2, 0.0, 0.1]))
 
 
-def test_matter_that_changes_is_taken_time_by_time(monkeypatch):
+def test_matter_that_changes_is_taken_time_by_time():
     """Other cells at every second time; without flow and bodies, which take long."""
-    monkeypatch.setattr(motion_choice, "reconstruct_moving", lambda *args, **how: None)
-    monkeypatch.setattr(motion_choice, "track", lambda part, *args, **how: missing(part))
     decision = choose_motion(moving(6, (1, 4, 1, 4, 1, 4)), known(20.0), QUICK, matter="levels")
     assert decision.choice == "each"
     assert decision.compared[0].loses
-    assert [each.name for each in decision.compared] == ["still", "flow", "bodies"]
+
+
+WAYS = {"reconstruct": "still", "reconstruct_moving": "flow", "track": "bodies"}
+"""What finds each way."""
+
+
+def stand_ins(monkeypatch, best: str) -> None:
+    """Each way says that it is half done; `best` finds the truth, others a ball beside it."""
+
+    def of(way):
+        def find(*scan, **how):
+            how["on_progress"]("fit", 0.5, {})
+            found = SimpleNamespace(object=truth() if way == best else ball(5e-6))
+            return SimpleNamespace(reconstruction=found) if way == "flow" else found
+
+        return find
+
+    for name, way in WAYS.items():
+        monkeypatch.setattr(motion_choice, name, of(way))
+
+
+@pytest.mark.parametrize("best", ["flow", "bodies"])
+@pytest.mark.parametrize(
+    ("method", "matter", "tried"),
+    [
+        (Auto(), None, ["still", "flow", "bodies"]),
+        (Auto(), "continuous", ["still", "flow"]),
+        (Auto(), "levels", ["still"]),
+        (QUICK, None, ["still"]),
+    ],
+)
+def test_what_the_options_forbid_is_not_chosen(monkeypatch, scan, best, method, matter, tried):
+    """Though it would predict best: --motion flow and bodies refuse these methods and kinds of matter."""
+    stand_ins(monkeypatch, best)
+    decision = choose_motion(scan, known(20.0), method, matter=matter)
+    assert [each.name for each in decision.compared] == tried
+    assert decision.choice == (best if best in tried else "each")
 
 
 def test_few_times_and_few_frames_are_refused(scan):
@@ -117,7 +154,10 @@ def test_the_command_takes_what_was_chosen_says_of_each_time_and_goes_on(asked, 
     text = (tmp_path / "out" / page).read_text(encoding="utf-8")
     assert "times set aside" in text
     if motion == "still":
-        assert f"of {TIMES} times are " in text
+        assert f"of {TIMES} times are not explained" in text
+        (said,) = re.findall("Times: [^<]*", text)
+        assert ".." not in said
+        assert ".;" not in said
     else:
         worked(command("export", tmp_path / "out", "--volume", tmp_path / "v.h5", "--time-frame", "all"))
         last = tmp_path / "out" / "tasks" / "0000" / f"t{TIMES - 1:04d}"
@@ -125,7 +165,10 @@ def test_the_command_takes_what_was_chosen_says_of_each_time_and_goes_on(asked, 
         one, other = (read_volume(tmp_path / name).delta for name in (f"v_t{TIMES - 1:04d}.h5", "last.h5"))
         np.testing.assert_array_equal(one, other)
         assert f"a series of {TIMES} times" in worked(command("info", tmp_path / "out")).out
-        refused(command("evaluate", tmp_path / "out"), "it is a series, each time of which has a run folder")
+        refused(
+            command("evaluate", tmp_path / "out"),
+            "whose run folders are in tasks/, as tasks/0000/t0000: name one",
+        )
     monkeypatch.setattr(motion_choice, "choose_motion", missing)  # nobody asks it again
     again = worked(command(*asked, "--resume"))
     assert found.line in again.err
@@ -138,17 +181,25 @@ def test_what_was_begun_without_a_decision_does_not_go_on_with_one(asked, tmp_pa
     assert begun_motion(tmp_path / "out") is None
 
 
-def test_what_is_of_one_time_is_refused_before_the_decision(asked):
+def test_what_is_of_one_time_is_refused_before_the_decision(asked, monkeypatch):
+    monkeypatch.setattr(motion_choice, "choose_motion", lambda *args, **how: pytest.fail("it was made"))
+    refused(command(*asked, "--fading", 0.3), "--fading is of matter that a flow carries")
     refused(command(*asked, "--time-frame", 1), "--motion auto takes all times")
     refused(command(*asked, "--refine", "shifts"), "--refine is of one time")
     refused(command(*asked, "--strict"), "--view and --strict are of one time")
 
 
-def test_progress_says_what_is_tried(monkeypatch):
+def test_progress_says_what_is_tried(monkeypatch, scan):
     heard = set[str]()
-    monkeypatch.setattr(motion_choice, "reconstruct_moving", lambda *args, **how: how["on_progress"]("fit", 0.5, {}))
-    monkeypatch.setattr(motion_choice, "track", lambda part, *args, **how: missing(part))
-    choose_motion(moving(6), known(20.0), QUICK, matter="levels", on_progress=lambda stage, *_: heard.add(stage))
-    assert "motion, flow: fit" in heard
-    for way in ("still", "a time by itself"):
-        assert any(stage.startswith(f"motion, {way}: ") for stage in heard)
+    stand_ins(monkeypatch, "still")
+    choose_motion(scan, known(20.0), on_progress=lambda stage, *_: heard.add(stage))
+    assert heard == {f"motion, {way}: fit" for way in ("still", "flow", "bodies", "a time by itself")}
+
+
+@pytest.mark.parametrize(
+    "decided", [3, {MOTION: 3}, {MOTION: {"choice": "each"}}, {MOTION: Decision(MOTION, "spin", "").as_dict()}]
+)
+def test_a_damaged_decision_is_refused_in_a_sentence(tmp_path, decided):
+    (tmp_path / "provenance.json").write_text(json.dumps({"records": [{"decided": decided}]}), encoding="utf-8")
+    with pytest.raises(InputError, match=r"provenance\.json must be as it was written"):
+        begun_motion(tmp_path)

@@ -63,7 +63,7 @@ class CarriedFlags:
         """`InputError` where something of it is asked of one time."""
         require(
             self.fading == 0 or reading.part.time_frame == "all",
-            "--fading is of matter that a flow carries; add --motion flow, or leave it.",
+            "--fading is of matter that a flow carries; name --motion flow (auto may choose another), or leave it.",
         )
 
 
@@ -148,11 +148,12 @@ def reconstruct(
 
     method, begun = asked.how.chosen(), asked.motion.applied(reading)
     by_time = asked.motion.motion in ("auto", "bodies") or begun.part.time_frame == "each"
-    require(not (by_time and (live.view or strict)), "--view and --strict are of one time; leave them, or choose one.")
+    stray = by_time and (live.view or strict)
+    require(not stray, "--view and --strict are of one time; leave them, or choose a time with --time-frame.")
+    asked.motion.require_all(begun)
     if asked.motion.motion == "auto":
         asked = _with_motion(scan, out, asked, reading, seed, resume)
     reading = asked.motion.applied(reading)
-    asked.motion.require_all(reading)
     if asked.motion.motion == "bodies" or reading.part.time_frame == "each":
         _time_by_time(scan, out, asked, reading, seed, resume)
         return
@@ -190,7 +191,7 @@ def _with_motion(scan: Path, out: Path, asked: Asked, reading: Reading, seed: in
     from ..io.atomic import is_taken
     from ..io.formats import read_frames
     from ..io.provenance import command_now
-    from ..workflows.motion_choice import MOTION, begun_motion, choose_motion
+    from ..workflows.motion_choice import MOTION, begun_motion, choose_motion, motion_of
 
     settings = asked.each_time(asked.how.chosen(), reading, seed)
     decision = begun_motion(out) if resume else None
@@ -207,8 +208,7 @@ def _with_motion(scan: Path, out: Path, asked: Asked, reading: Reading, seed: in
         if command := command_now():
             command.decided[MOTION] = decision.as_dict()
     say(decision.line)
-    chosen = {each: each for each in ("still", "each", "flow", "bodies")}[decision.choice]
-    return replace(asked, motion=replace(asked.motion, motion=chosen))
+    return replace(asked, motion=replace(asked.motion, motion=motion_of(decision)))
 
 
 def _time_by_time(scan: Path, out: Path, asked: Asked, reading: Reading, seed: int, resume: bool) -> None:
@@ -221,8 +221,7 @@ def _time_by_time(scan: Path, out: Path, asked: Asked, reading: Reading, seed: i
         asked.require_bodies(method)
         track(scan, out, asked.matter, seed=seed, resume=resume, reading=reading, illumination=asked.illumination)
     else:
-        settings = asked.each_time(method, reading, seed)
-        reconstruct_each(scan, out, settings, asked.matter.prior, reading, resume)
+        reconstruct_each(scan, out, asked.each_time(method, reading, seed), asked.matter.prior, reading, resume)
 
 
 def _scored(
@@ -241,8 +240,9 @@ def _scored(
     placed = result.placed(measured)
     evaluation = score(result, placed, None)
     if reading.part.time_frame in ("all", "still"):
-        each = result.placed(read_frames(scan, replace(reading, part=replace(reading.part, time_frame=None))))
-        write_times(folder.path / TIMES, result, each.in_memory(), evaluation.light)
+        every = replace(reading, told=reading.told.at_middle(), part=replace(reading.part, time_frame=None))
+        each = result.placed(read_frames(scan, every)).in_memory()
+        write_times(folder.path / TIMES, result, each, evaluation.light)
     if instants_of(folder):
         return evaluation, report_of_middle(folder, result, placed)
     return evaluation, report_run(folder, result, placed, evaluation, None)

@@ -78,6 +78,7 @@ class Stage:
         """Whether all of an output is there and sound: itself, or a file for each time of the run that is exported."""
         from ..workflows.reconstruction import instants_of
         from ..workflows.run_folder import RunFolder, check
+        from .scans import runs_of
 
         if is_run(out.path):
             run = RunFolder(out.path)
@@ -92,7 +93,8 @@ class Stage:
             return False
         whole = out.is_there() or self.name != "export"
         files = [out.path] if whole else of_times(out.path)
-        wanted = 1 if whole else len(instants_of(RunFolder(self.given.arguments["run"])))
+        source = None if whole else self.given.arguments["run"]
+        wanted = 1 if source is None else len(runs_of(source) or instants_of(RunFolder(source)))
         return 0 < len(files) == wanted and all(
             file.exists() and not (is_hdf5(file) and check(file)[1]) for file in files
         )

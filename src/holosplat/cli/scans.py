@@ -70,9 +70,10 @@ class Moment:
 def runs_of(path: Path) -> list[tuple[float, RunFolder]]:
     """The times [s] of a series of single times, and their run folders; nothing for what is no such series."""
     series = SeriesFolder(path)
-    if not series.file.is_file() or series.plan().settings.act == "track":
+    plan = series.plan() if series.file.is_file() else None
+    if plan is None or plan.settings.act == "track":
         return []
-    each = [(window.number, moment) for window in series.plan().windows() for moment in window.own]
+    each = [(window.number, moment) for window in plan.windows() for moment in window.own]
     return [(moment.time, RunFolder(series.run(task, moment.number))) for task, moment in each]
 
 
@@ -80,10 +81,18 @@ def moments_of(folder: RunFolder, time_frame: int | Literal["all"] | None) -> It
     """A run, or a series of single times, at the times that are asked for.
 
     time_frame: of a series and of a run in motion, the time, counted from 0 (default: the first), or "all". Errors:
-    `InputError` for times that they do not have, and for any of a run that stands still.
+    `InputError` for times that they do not have or that are not done, before the first, and for any of a run that
+    stands still.
     """
     runs = runs_of(folder.path)
-    for k in chosen_frames(time_frame, [time for time, _ in runs]) if runs else ():
+    chosen = chosen_frames(time_frame, [time for time, _ in runs]) if runs else []
+    for k in chosen:
+        require(
+            runs[k][1].config.is_file() and runs[k][1].result().is_file(),
+            f"time {k} of {folder.path} is not done; finish it with holosplat series run {folder.path}, or name "
+            "another --time-frame.",
+        )
+    for k in chosen:
         time, run = runs[k]
         result = load_reconstruction(run)
         bodies = result.object.bodies() if isinstance(result.object, SurfaceMesh) else None

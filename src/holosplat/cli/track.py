@@ -20,7 +20,7 @@ from ..io.reading import Reading
 from ..io.vtk import write_mesh
 from ..matter import KnownSeveral, MaterialPrior, MatterKind
 from ..mesh import TriangleMesh
-from ..methods import Auto, Method
+from ..methods import Method
 from ..methods.surface_fit import SurfaceOptions, oversampling
 from ..methods.surfaces import refine_surfaces
 from ..motion.flow_reconstruction import FlowOptions
@@ -34,6 +34,7 @@ from ..representations import MovingSurfaces
 from ..scan import Scan
 from ..workflows.evaluate import TIMES, lines_of_times, score_object, write_times
 from ..workflows.evaluate import evaluate as score
+from ..workflows.motion_choice import may_flow
 from ..workflows.provenance import scan_hash
 from ..workflows.reconstruct import load_reconstruction
 from ..workflows.reconstruction import Reconstruction, instants_of, reconstruction_at
@@ -189,7 +190,7 @@ FEWEST_TIMES = 3
 def asks_for_motion(reading: Reading, method: Method, matter: MatterKind | None, plain: bool) -> bool:
     """Whether --motion flow is to find motion: where the method is left to the program, matter is not said to have
     levels, and nothing else is asked for (`plain`)."""
-    return reading.part.time_frame == "all" and isinstance(method, Auto) and matter != "levels" and plain
+    return reading.part.time_frame == "all" and may_flow(method, matter) and plain
 
 
 def may_go_on(folder: RunFolder, resume: bool) -> bool:

@@ -86,17 +86,21 @@ def facts_of_series(path: Path) -> Facts:
         from ..workflows.verdict import said_of_times
 
     with as_written(path / SERIES, "the plan of a series"):
-        scans = [(str(one["path"]), len(one["times_s"])) for one in read_json(path / SERIES)["scans"]]
+        plan = read_json(path / SERIES)
+        tracked = plan["settings"]["act"] == "track"
+        scans = [(str(one["path"]), len(one["times_s"])) for one in plan["scans"]]
     with as_written(path, "rows of a series"):
-        rows = {row["number"]: row for row in map(read_json, sorted(path.glob("tasks/*/*.row.json")))}
+        files = sorted(path.glob("tasks/*/*.row.json"), reverse=True)  # of a time of two tasks, the first one's row
+        rows = {row["number"]: row for row in map(read_json, files)}
         done = [row for _, row in sorted(rows.items()) if row["status"] == "done"]
         judged = [(row["number"], bool(row["good"]), str(row["words"])) for row in done if row["good"] is not None]
     chosen, count = begun_motion(path), sum(times for _, times in scans)
     said = {"what": f"a series of {count} times", "made from": ", ".join(scan for scan, _ in scans)}
     said |= {"state": f"{len(done)} of {count} times are done"}
-    said |= {"verdict": "; ".join(line.strip() for line in said_of_times(judged, count))} if judged else {}
+    said |= {"verdict": "; ".join(line.strip().rstrip(".") for line in said_of_times(judged, count))} if judged else {}
     said |= {"chosen": chosen.line} if chosen else {}
-    commands = (f"holosplat series collect {path}", f"holosplat export {path} --volume v.h5 --time-frame all")
+    run = path / "tasks" / "0000" / "run" if tracked else path
+    commands = (f"holosplat series collect {path}", f"holosplat export {run} --volume v.h5 --time-frame all")
     return Facts(said, (), commands)
 
 

@@ -61,7 +61,7 @@ def report_run(
     remark: a sentence on what `scan` is a part of, which follows the summary of it.
     """
     config, moving, chosen = folder.read_config(), None, begun_motion(folder.path)
-    times = "; ".join(line.strip() for line in lines_of_times(folder.path / TIMES))
+    times = "; ".join(line.strip().rstrip(".") for line in lines_of_times(folder.path / TIMES))
     remark = " ".join(filter(None, (remark, times and f"Times: {times}.")))
     turned = found = reconstruction.object
     if isinstance(found, MovingSurfaces):

@@ -229,7 +229,8 @@ TIMES = "times.csv"
 
 
 def write_times(path: Path, reconstruction: Reconstruction, scan: Scan, lit: Light | None = None) -> None:
-    """Write whether the training frames of each time of `scan` are explained, a row each; lit: as above."""
+    """Write whether the training frames of each time of `scan` are explained, a row each; lit: the light of all
+    frames, which divides them and whose doubt counts as noise, None where it is even."""
     found, doubt = _where_it_is_judged(reconstruction), None
     if lit is not None:
         scan, doubt = replace(scan, frames=lit.evened(torch.from_numpy(scan.frames)).numpy()), lit.doubt

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -47,7 +47,9 @@ def choose_motion(
 
     Some times are set aside. Still matter, flow and bodies are found in the frames of the others; the null, a time by
     itself, in its own frames but one, which all of them predict. So what is taken in place of the null predicts times
-    that it has not seen better than they themselves do. Errors: `InputError` for few times, and for times of one frame.
+    that it has not seen better than they themselves do. A flow and bodies are tried where `method` and `matter` leave
+    them open, as --motion flow and bodies do. on_progress: called with the way and its stage, the fraction of it that
+    is done, and a record of numbers. Errors: `InputError` for few times, and for times of one frame.
     """
 
     def of(way: str) -> FitProgress:
@@ -60,19 +62,39 @@ def choose_motion(
         found = reconstruct_moving(part, prior, seed=seed, light=light, on_progress=of("flow"))
         return None if found is None else found.reconstruction.object
 
-    ways: Mapping[str, Way] = {
-        "still": lambda part: alone(merged(part), "still"),
-        "flow": carried,
-        "bodies": lambda part: track(part, prior, seed=seed, light=light, on_progress=of("bodies")).object,
-    }
+    ways: dict[str, Way] = {"still": lambda part: alone(merged(part), "still")}
+    if may_flow(method, matter):
+        ways["flow"] = carried
+    if isinstance(method, Auto) and matter is None:
+        ways["bodies"] = lambda part: track(part, prior, seed=seed, light=light, on_progress=of("bodies")).object
     return decide(scan.train(), alone, ways)
 
 
+def may_flow(method: Method, matter: MatterKind | None) -> bool:
+    """Whether a flow may carry the matter: the method is left to the program, and matter not said to have levels."""
+    return isinstance(method, Auto) and matter != "levels"
+
+
+def motion_of(decision: Decision) -> Motion:
+    """The way that a decision took. Errors: `InputError` for one of something else."""
+    known: dict[str, Motion] = {each: each for each in get_args(Motion)}
+    found = known.get(decision.choice)
+    if found is None:
+        raise InputError(f"the motion must be one of {', '.join(known)}, but it is {decision.choice[:40]!r}.")
+    return found
+
+
 def begun_motion(folder: Path) -> Decision | None:
-    """What the `--motion auto` that began a folder has decided; None where none did."""
-    said = next((each["decided"][MOTION] for each in records(folder) if MOTION in each.get("decided", {})), None)
+    """What the `--motion auto` that began a folder has decided; None where none did.
+
+    Errors: `InputError` where provenance.json says something else of it.
+    """
     with as_written(folder / NAME):
-        return None if said is None else Decision.from_dict(said)
+        said = next((each["decided"][MOTION] for each in records(folder) if MOTION in each.get("decided", {})), None)
+        found = None if said is None else Decision.from_dict(said)
+        if found is not None:
+            motion_of(found)
+        return found
 
 
 def decide(train: Scan, alone: Way, ways: Mapping[str, Way]) -> Decision:

@@ -93,7 +93,9 @@ class RunFolder:
         found = self.config.is_file() and self.result().is_file()
         hint = "; it was cut off, finish it with --resume" if self.config.is_file() else ""
         if (self.path / SERIES).is_file():
-            hint = "; it is a series, each time of which has a run folder in tasks/, as tasks/0000/t0000: name that"
+            run = min(self.path.glob("tasks/*/*/config.json"), default=None)
+            named = f"as {run.parent.relative_to(self.path).as_posix()}: name one" if run else "but none has begun"
+            hint = f"; it is a series, whose run folders are in tasks/, {named}"
         require(found, f"{self.path} must hold a reconstruction (config.json, object.h5), but it does not{hint}.")
 
     def result(self) -> Path:
