@@ -1,6 +1,6 @@
 """The options of every tomography, scanned on tuning scenes (seeds below 100): where the defaults come from.
 
-    python benchmarks/tune_tomography.py                # all methods and scenes: an hour on two cores
+    python benchmarks/tune_tomography.py                # all scenes, all methods but svmbir: an hour on two cores
     python benchmarks/tune_tomography.py --methods tv sirt --scenes main12 --seeds 1 2
     python benchmarks/tune_tomography.py --defaults     # the defaults only; held-out frames are predicted too
 

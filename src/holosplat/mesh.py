@@ -115,7 +115,7 @@ def winding_number(triangles: np.ndarray, point: np.ndarray) -> float:
 
 
 def vector_areas(mesh: TriangleMesh) -> np.ndarray:
-    """[F, 3] m²: normals of the triangles, as long as these are large."""
+    """[F, 3] m²: normals of the triangles, of the length of the triangle's area."""
     a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
     return 0.5 * np.cross(b - a, c - a)
 

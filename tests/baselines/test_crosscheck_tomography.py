@@ -9,10 +9,15 @@ import numpy as np
 import pytest
 import torch
 
+from holosplat.baselines import TOMOGRAPHIES
 from holosplat.baselines.algebraic import Algebraic, Ramp, filtered_backprojection, sirt
 from holosplat.checks import InputError, MissingError
 from holosplat.geometry import Grid, Views
+from holosplat.matter import DeltaBeta, MaterialPrior
+from holosplat.methods import PerView
+from holosplat.methods.method import Task
 from holosplat.projectors.voxels import SliceProjector
+from holosplat.scan import Exposures, Scan
 from holosplat_bench.opponents import mbir as other
 
 SIDE, ROWS = 49, 3
@@ -171,3 +176,21 @@ def test_without_svmbir_it_says_what_to_install(monkeypatch):
     views = views_at()
     with pytest.raises(MissingError, match=r"pip install 'holosplat\[bench\]'"):
         other.svmbir_volume(as_thickness(disc_lines()), views, Grid.of_views(views), None, quiet)
+
+
+def test_svmbir_is_the_benchmarks_alone():
+    """No table of the core has it, whatever is imported; the benchmark's method has it, and no other tomography."""
+    assert "svmbir" not in TOMOGRAPHIES
+    with pytest.raises(InputError, match="tomography must be one of fbp, art, sirt, sirt-nonneg, tv, but"):
+        PerView(tomography="svmbir")
+    with pytest.raises(InputError, match="tomography must be one of svmbir, but it is 'tv'"):
+        other.MbirPerView(tomography="tv")
+
+
+def test_the_benchmarks_method_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "svmbir", None)
+    exposures = Exposures.of(views_at(), 20.0, 0.01)
+    scan = Scan(np.ones((len(ANGLES), ROWS, SIDE), dtype=np.float32), exposures, np.zeros(len(ANGLES), dtype=bool))
+    (stage,) = other.MbirPerView("paganin", bounded=False).stages()
+    with pytest.raises(MissingError, match="this method needs the package svmbir"):
+        stage.start(Task(scan, MaterialPrior.known(DeltaBeta(1e-6, 1e-9))), None)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from helpers.motion_shadows import FLOW, OTHER, TURN, cell, pose, shadows
 from holosplat.bodies import neighbourhood_search
@@ -53,6 +54,22 @@ def test_a_search_begins_with_what_is_known_where_that_explains_more(monkeypatch
     assert len(found) == 2
     for one in truth:
         assert min(np.linalg.norm(other.centre - one.centre) for other in found) < 0.3
+
+
+@pytest.mark.parametrize("width", [32, 33])
+def test_energies_of_templates_are_sums_over_all_frequencies(width):
+    """Σ |F|² I / (H W) of whole spectra, of which half is kept; images are white, up to the highest frequency."""
+    seen = shadows([pose(TURN, (0.0, 0.0, 0.0))])
+    seen = replace(seen, thickness=seen.thickness[..., :width])
+    images = torch.randn(4, 2, 6, 6, generator=torch.Generator().manual_seed(1))
+    templates = Templates(np.tile(np.eye(3), (4, 1, 1)), images, np.array([0, 1] * 3), 2.5, 50.0)
+    search = TemplateSearch(templates, seen, FLOW[None])
+    columns = np.arange(search.size[1])
+    for n, direction in enumerate(templates.directions):
+        known = seen.information(n, search.size)[:, np.minimum(columns, search.size[1] - columns)]
+        powers = torch.fft.fft2(images[:, direction], s=search.size).abs().square()
+        wanted = (powers * known).sum((-1, -2)) / (search.size[0] * search.size[1])
+        assert search.whole[n].numpy() == pytest.approx(wanted.numpy(), rel=1e-5)
 
 
 def test_ghosts_are_exchanged_for_bodies():

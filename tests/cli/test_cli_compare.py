@@ -9,8 +9,9 @@ import pytest
 
 from helpers.cli import COLUMNS, PIXEL, ROWS, Workshop, holosplat, refused, worked
 from holosplat.cli.view import _side
+from holosplat.inference import Decision
 from holosplat.metrics import fourier_shell_correlation
-from holosplat.report.compare import Comparison, differing, in_columns
+from holosplat.report.compare import Comparison, chosen, differing, in_columns
 from holosplat.report.page import Table
 
 
@@ -41,6 +42,14 @@ def test_what_differs_is_said_on_the_terminal_and_on_the_page(shop, coarse, tmp_
         assert words in page
     assert "warmup_steps" not in said  # a usual setting that the other method does not have
     refused(holosplat("compare", shop.run, coarse, "--out", tmp_path / "page.html"), "page.html must be new")
+
+
+def test_a_name_that_is_decided_again_keeps_its_choices_in_order():
+    made = [
+        Decision(name, choice, "held-out views")
+        for name, choice in (("twins", "one"), ("start", "usual"), ("twins", "other"))
+    ]
+    assert chosen(made) == {"twins": "one, other", "start": "usual"}
 
 
 def test_volumes_of_other_pixels_are_compared_on_one_grid(shop, coarse):

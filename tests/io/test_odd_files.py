@@ -17,7 +17,7 @@ from holosplat.io.angles import in_order, read_angles
 from holosplat.io.formats import read_as
 from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.io.reading import Reading, Told
-from holosplat.io.stacks import stack_of
+from holosplat.io.stacks import open_tiff, stack_of
 
 # --- the order of frames ------------------------------------------------------------------------------------------
 
@@ -380,6 +380,13 @@ def test_white_that_is_zero_becomes_the_greatest_number(tmp_path, caplog):
     tifffile.imwrite(tmp_path / "b.tif", FRAMES[0].astype(np.float32), photometric="miniswhite")
     with pytest.raises(InputError, match="0 is white, which has no meaning for float32"):
         stack_of(tmp_path / "b.tif")
+
+
+def test_a_refusal_that_names_a_package_stays_one(tmp_path):
+    tifffile.imwrite(file := tmp_path / "imagecodecs.tif", FRAMES[0])
+    with pytest.raises(InputError, match="must be other") as refused, open_tiff(file):
+        raise InputError(f"{file} must be other.")
+    assert type(refused.value) is InputError
 
 
 def test_the_package_for_compressed_images_is_named(tmp_path, monkeypatch):

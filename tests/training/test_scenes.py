@@ -8,13 +8,18 @@ import numpy as np
 import pytest
 from torch.nn.functional import avg_pool2d
 
+from holosplat.beamline.declaration import Matter, Substance, case_of
 from holosplat.checks import InputError
 from holosplat.learning.network import FINE, coarse, thickness_of
+from holosplat.materials import DeltaBeta
+from holosplat.specimens.drawn import Substances
+from holosplat.specimens.fluids import Bubbles
 from holosplat.training.folder import Dataset, write_datasheet
 from holosplat.training.options import Ranges
 from holosplat.training.sample import Sample, draw_scene, sample_of
 from holosplat.training.shown import make_example
 
+WATER = Substance("H2O", 1.0)
 TINY = Ranges(rows=34, columns=30, views=3, held_out=1, across=(9.0, 11.0), fresnel=(0.02, 0.1), noiseless=1.0)
 
 
@@ -47,6 +52,22 @@ def test_every_kind_can_be_imaged(kind):
 
     assert 0 < found.occupancy.mean() / 255 < 0.6
     assert np.abs(found.contrast).max() > 0
+
+
+def test_matter_that_fills_the_field_can_be_declared():
+    """Bubbles in water, seen as the kind itself draws them."""
+    declared = draw_scene(TINY, 3, 0)
+    pixel = declared.detector.pixel_size
+    declared = replace(declared, specimen=Bubbles(20 * pixel, 3), matter=Matter(Substance("vacuum"), None, WATER))
+    water = WATER.delta_beta(declared.beam.energy_kev)
+    drawn = declared.specimen.drawn(Substances(DeltaBeta(0.0, 0.0), None, water), 5)
+
+    case = case_of(declared, "bubbles", 5)
+
+    assert case.specimen == drawn.text
+    (_, seen), (_, expected) = (scene.project(case.exposures.views) for scene in (case.scene, drawn.scene))
+    assert np.array_equal(seen, expected)
+    assert seen.min() < 0
 
 
 def test_a_medium_turns_the_sign_of_the_absorption_and_changes_nothing_else_that_is_drawn():

@@ -29,8 +29,8 @@ from ..ranges import (
     checked_dataclass,
 )
 from ..scan import Exposures, Scan
-from ..specimens.drawn import Scene, SpecimenKind
-from ..specimens.matter import ContinuousKind, MeshedKind
+from ..specimens.drawn import Scene, Substances
+from ..specimens.matter import ContinuousKind, Declarable, FieldMatter
 from ..specimens.phantoms import Ball
 from ..specimens.scene import MeshScene
 from ..volume import Volume
@@ -138,7 +138,7 @@ class Declaration:
     differs from the flat field on frames for training; misalignment: errors of the geometry for methods."""
 
     summary: str
-    specimen: SpecimenKind
+    specimen: Declarable
     matter: Matter
     beam: Beam
     detector: Detector
@@ -183,14 +183,17 @@ class Declaration:
         The core of a mesh adds what it is filled with, less the material around it.
         """
         material, medium = self._delta_beta(self.matter.material), self._delta_beta(self.matter.medium)
+        core = None if self.matter.core is None else self._delta_beta(self.matter.core)
+        if isinstance(self.specimen, FieldMatter):
+            found = self.specimen.drawn(Substances(material, core, medium), seed)
+            return found.scene, found.text, ()
         if isinstance(self.specimen, ContinuousKind):
-            cores = [self._delta_beta(self.matter.core).against(medium)] if self.matter.core else []
+            cores = [] if core is None else [core.against(medium)]
             return *self.specimen.continuous(seed, [material.against(medium), *cores]), ()
-        assert isinstance(self.specimen, MeshedKind)
         bodies = self.specimen.bodies(seed, snapshots)
         filling = [material.against(medium)] * len(bodies.outer)
-        if self.matter.core is not None:
-            filling += [self._delta_beta(self.matter.core).against(material)] * len(bodies.cores)
+        if core is not None:
+            filling += [core.against(material)] * len(bodies.cores)
         return MeshScene((*bodies.outer, *bodies.cores), tuple(filling)), bodies.text, bodies.balls
 
     @property

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..frames import rfft_weights
 from ..mesh import TriangleMesh
 from ..projectors.surface import surface_thickness
 from .shadows import Shadows
@@ -108,9 +109,8 @@ class TemplateSearch:
         self.part = (seen_part / squares.sum((2, 3))[..., None]).clamp(0, 1)
         away = np.arange(s) - (s - 1) / 2
         ball = torch.from_numpy((np.hypot(away[:, None], away) <= 0.5 * templates.reach).astype(np.float32))
-        twice = torch.full((self.spectra.shape[-1],), 2.0)
-        twice[0] = 1
-        powers = self.spectra.abs().square() * twice / (self.size[0] * self.size[1])
+        counts = torch.from_numpy(rfft_weights(self.size[1]).astype(np.float32))
+        powers = self.spectra.abs().square() * counts / (self.size[0] * self.size[1])
         self.information = [seen.information(n, self.size) for n in range(len(seen))]
         pairs = zip(self.information, templates.directions)
         self.whole = torch.stack([(powers[:, u] * known).sum((-1, -2)) for known, u in pairs])

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import MissingError, note, require, require_regular
+from ..checks import InputError, MissingError, note, require, require_regular
 from .guard import RATIO, SMALL, mapped_array, require_declared, require_inflated, require_memory, undamaged
 from .leftovers import is_hidden
 
@@ -147,6 +147,8 @@ def open_tiff(file: Path) -> Iterator[Any]:
         try:
             with tifffile.TiffFile(file) as opened:
                 yield opened
+        except InputError:
+            raise  # its text may hold any word, as a file's name does
         except Exception as error:
             if "imagecodecs" not in str(error):
                 raise

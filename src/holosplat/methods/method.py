@@ -65,7 +65,7 @@ class Task:
     delta_told: whether prior or frames say what δ is
     freedom: of where the frames are, which fits then find, too; None: they are where the scan says
     near: whether what the next fit starts from is near to where it ends (see `Near`)
-    on_start: called with the decision about where a fit starts, and the guess, where a network was asked
+    on_start: called with each decision about where fits start, and the guess, where a network was asked
     """
 
     scan: Scan

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
 
-from ..baselines import TOMOGRAPHIES
+from ..baselines import TOMOGRAPHIES, Tomography
 from ..checks import InputError
 from ..geometry import Grid
 from ..matter import Matter
@@ -24,6 +25,8 @@ class PerView(Method):
     kind: ClassVar[str] = "per-view"
     cones: ClassVar[bool] = True
     two_sided: ClassVar[bool] = True
+    tomographies: ClassVar[Mapping[str, Tomography]] = TOMOGRAPHIES
+    """Name → tomography, of those to choose from; other packages' classes may have their own."""
 
     retrieval: str = "tikhonov"
     """Name of the phase retrieval."""
@@ -35,7 +38,7 @@ class PerView(Method):
     def __post_init__(self) -> None:
         for name, value, choices in (
             ("retrieval", self.retrieval, tuple(RETRIEVALS)),
-            ("tomography", self.tomography, tuple(TOMOGRAPHIES)),
+            ("tomography", self.tomography, tuple(self.tomographies)),
         ):
             if value not in choices:
                 raise InputError(f"{name} must be one of {', '.join(choices)}, but it is {value!r}.")
@@ -63,7 +66,7 @@ class PerViewStage:
         thickness = retrieve(frames, scan.exposures, *material, on_progress=report, **known)
         grid, report = Grid.of_views(scan.views), task.report(self.name)
         upper = (task.bound(1.0) or None) if how.bounded else None
-        values = TOMOGRAPHIES[how.tomography](thickness, scan.views, grid, upper, report, **known)
+        values = how.tomographies[how.tomography](thickness, scan.views, grid, upper, report, **known)
         return VoxelGrid(values[None], grid, Matter.one(*material))
 
     def fit(self, task: Task, start: Stored) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import zip_longest
@@ -14,6 +14,7 @@ import numpy as np
 
 from ..checks import as_written
 from ..geometry import Grid
+from ..inference import Decision
 from ..io.atomic import atomic_path
 from ..methods import METHODS
 from ..metrics import VolumeScores, volume_scores
@@ -166,11 +167,9 @@ class Comparison:
         return Table("The volumes", rows)
 
     def _decisions(self) -> Table:
-        made = [{each.name: each.choice for each in side.result.choice.decisions} for side in self.sides]
-        made = [
-            found | {"kept state": side.result.choice.kept or "–", "kind of matter": side.result.choice.matter}
-            for found, side in zip(made, self.sides)
-        ]
+        made = []
+        for choice in (side.result.choice for side in self.sides):
+            made.append(chosen(choice.decisions) | {"kept state": choice.kept or "–", "kind of matter": choice.matter})
         return Table("Decisions that differ", differing(*made), HEAD)
 
     def _settings(self) -> Table:
@@ -233,6 +232,14 @@ def differing(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[tuple
     names = [*first, *(name for name in second if name not in first)]
     pairs = ((name, str(first.get(name, "–")), str(second.get(name, "–"))) for name in names)
     return [pair for pair in pairs if pair[1] != pair[2]]
+
+
+def chosen(decisions: Sequence[Decision]) -> dict[str, str]:
+    """Name → what was chosen; where one name is decided several times, all choices in their order."""
+    found = dict[str, str]()
+    for each in decisions:
+        found[each.name] = f"{found[each.name]}, {each.choice}" if each.name in found else each.choice
+    return found
 
 
 def _cause(side: Side) -> str:

@@ -276,14 +276,14 @@ def _views_table(content: ReportContent) -> Table | None:
 
 
 def _decisions_table(content: ReportContent) -> Table | None:
-    """What was decided, and by how much each candidate predicts unseen frames better than what stood before it."""
+    """What was decided, and by how much smaller each candidate's residual is than that of what stood before it."""
     if not content.decisions:
         return None
     rows = []
     for each in content.decisions:
         tried = (f"{one.name}: {percent(one.gain)} ± {100 * one.error:.1f} %" for one in each.compared)
         rows.append((each.name, each.choice, each.by, "; ".join(tried), f"{each.seconds:.1f}\u00a0s"))
-    head = ("decision", "choice", "by", "smaller residual of unseen frames", "time")
+    head = ("decision", "choice", "by", "smaller residual", "time")
     return Table("Decisions", rows, head)
 
 

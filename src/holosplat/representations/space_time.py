@@ -119,7 +119,8 @@ class SpaceTimeField:
         require(upper >= 0, f"upper must not be negative, but it is {upper:g}.")
         require(basis.first < basis.last, "a space-time field needs times that grow; give two or more.")
         self.lattice = lattice_of(grid, options.cell_px)
-        wanted = {COEFFICIENTS: torch.empty(basis.count, *self.lattice.counts), **options.velocity.started(0)}
+        lattice = torch.empty(basis.count, *self.lattice.counts, device="meta")  # of its shape alone
+        wanted = {COEFFICIENTS: lattice, **options.velocity.started(0)}
         require_shapes("{} of a space-time field", {**weights, COEFFICIENTS: coefficients}, wanted)
         self.coefficients, self.grid, self.basis, self.matter = coefficients, grid, basis, matter
         self.weights, self.options, self.upper, self.backend = dict(weights), options, float(upper), "cpu"

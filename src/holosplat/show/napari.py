@@ -19,7 +19,7 @@ from ..io.objects import FORMAT, read_object
 from ..io.objects import GAUSSIANS_FORMAT as GAUSSIANS
 from ..io.volumes import NAMES, read_volume
 from ..mesh import joined
-from ..representations import InMotion, Stored, SurfaceMesh
+from ..representations import InMotion, SurfaceMesh
 from ..volume import Volume
 from ..workflows.reconstruction import instants_of
 from ..workflows.run_folder import RunFolder
@@ -71,8 +71,9 @@ def layers(path: str) -> list[Layer]:
     moving = isinstance(obj, InMotion)
     about = {"kind": obj.kind, "described": obj.described} | ({"times_s": times} if moving and times else {})
     moments = list(at_times(obj, times).values())
-    if all(isinstance(moment, SurfaceMesh) for moment in moments):
-        return [_surface(found.stem, moments, moving, about)]
+    surfaces = [moment for moment in moments if isinstance(moment, SurfaceMesh)]
+    if len(surfaces) == len(moments):
+        return [_surface(found.stem, surfaces, moving, about)]
     grid = obj.enclosing_grid(MOST_VOXELS // len(moments))
     return _images(found.stem, [moment.voxelise(grid) for moment in moments], about, moving)
 
@@ -112,9 +113,9 @@ def _placed(grid: Grid, moving: bool) -> tuple[tuple[float, ...], tuple[float, .
     return ((1.0, *size), (0.0, *origin)) if moving else (size, origin)
 
 
-def _surface(name: str, moments: Sequence[Stored], moving: bool, about: dict[str, Any]) -> Layer:
+def _surface(name: str, moments: Sequence[SurfaceMesh], moving: bool, about: dict[str, Any]) -> Layer:
     """Triangles, whose vertices begin with the number of the time where they move."""
-    meshes = [moment.mesh() for moment in moments if isinstance(moment, SurfaceMesh)]
+    meshes = [moment.mesh() for moment in moments]
     whole, numbers = joined(meshes), np.repeat(np.arange(len(meshes)), [len(mesh.vertices) for mesh in meshes])
     places = MICROMETRES * whole.vertices[:, ::-1]
     data = (np.column_stack([numbers, places]) if moving else places, whole.faces)

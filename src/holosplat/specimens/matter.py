@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,12 +34,13 @@ Extents = tuple[Small, Small, Small]
 """`(x, y, z)` [m]."""
 
 
-class ContinuousKind(SpecimenKind):
+class ContinuousKind(SpecimenKind, ABC):
     """A kind of continuous matter."""
 
+    @abstractmethod
     def continuous(self, seed: int, matter: Sequence[DeltaBeta]) -> tuple[ContinuousScene, str]:
         """The scene that `seed` gives of `matter` against its medium, and what it is in words."""
-        raise NotImplementedError
+        ...
 
 
 @checked_dataclass
@@ -70,12 +72,13 @@ class Bodies:
     balls: tuple[Ball, ...] = ()
 
 
-class MeshedKind(SpecimenKind):
+class MeshedKind(SpecimenKind, ABC):
     """A kind of closed meshes."""
 
+    @abstractmethod
     def bodies(self, seed: int, snapshots: Path | None) -> Bodies:
         """The bodies that `seed` gives; snapshots: folder of simulated cells, for kinds that need one."""
-        raise NotImplementedError
+        ...
 
 
 @checked_dataclass
@@ -156,3 +159,7 @@ class FoamDrop(MeshedKind):
         foam = random_foam(self.drop, self.count, self.median, self.spread, seed=seed)
         cores = [bubble.mesh(4, f"bubble{i:03d}") for i, bubble in enumerate(foam.bubbles)]
         return Bodies(f"a drop with {self.count} bubbles, seed {seed}", [foam.drop.mesh(5, "drop")], cores)
+
+
+Declarable = ContinuousKind | MeshedKind | FieldMatter
+"""The kinds that a `Declaration` may be of."""

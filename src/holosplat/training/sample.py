@@ -19,8 +19,7 @@ from ..learning.start import retrieved_thickness
 from ..matter import DeltaBeta
 from ..optics.noise import noise_levels
 from ..scan import Exposures, Scan
-from ..specimens.drawn import SpecimenKind
-from ..specimens.matter import Capsules, CrowdedCells, FoamDrop, RedCells, SoftCells
+from ..specimens.matter import Capsules, CrowdedCells, Declarable, FoamDrop, RedCells, SoftCells
 from ..specimens.red_cells import DIAMETER, evans_fung_cell
 from ..specimens.scene import MeshScene
 from ..units import wavelength
@@ -155,7 +154,7 @@ def _log(rng: np.random.Generator, pair: tuple[float, float]) -> float:
     return float(math.exp(rng.uniform(*np.log(pair))))
 
 
-def _cells(rng: np.random.Generator, ranges: Ranges, diameter: float, room: Room) -> SpecimenKind:
+def _cells(rng: np.random.Generator, ranges: Ranges, diameter: float, room: Room) -> Declarable:
     """As many red cells as fill the drawn share of the room, of those that found a place one after the other."""
     one = evans_fung_cell(diameter).volume
     count = min(MOST_BODIES, max(1, round(_log(rng, ranges.filled) * room.volume / one)))
@@ -163,24 +162,24 @@ def _cells(rng: np.random.Generator, ranges: Ranges, diameter: float, room: Room
     return RedCells(count, diameter, room.box, room.shape, deform, 0, stretch)
 
 
-def _capsules(rng: np.random.Generator, ranges: Ranges, diameter: float, room: Room) -> SpecimenKind:
+def _capsules(rng: np.random.Generator, ranges: Ranges, diameter: float, room: Room) -> Declarable:
     """Shells about nothing, or about another material."""
     count = min(MOST_BODIES, max(1, round(_log(rng, ranges.filled) * room.volume / (0.5 * diameter**3))))
     return Capsules(count, (0.6 * diameter, diameter), diameter * rng.uniform(0.08, 0.2), room.box)
 
 
-def _foam(rng: np.random.Generator, ranges: Ranges, diameter: float, room: Room) -> SpecimenKind:
+def _foam(rng: np.random.Generator, ranges: Ranges, diameter: float, room: Room) -> Declarable:
     """A drop as large as the room with bubbles."""
     return FoamDrop(0.95 * room.least, int(rng.integers(5, 25)), rng.uniform(0.3, 0.6) * diameter)
 
 
-def _soft_cells(rng: np.random.Generator, ranges: Ranges, diameter: float, room: Room) -> SpecimenKind:
+def _soft_cells(rng: np.random.Generator, ranges: Ranges, diameter: float, room: Room) -> Declarable:
     """Continuous cells with nuclei and vacuoles."""
     count = min(MOST_BODIES, max(1, round(_log(rng, ranges.filled) * room.volume / (0.5 * diameter**3))))
     return SoftCells(count, (0.7 * diameter, 1.3 * diameter), room.box, 0.1 * diameter)
 
 
-def _crowd(rng: np.random.Generator, ranges: Ranges, diameter: float, room: Room) -> SpecimenKind:
+def _crowd(rng: np.random.Generator, ranges: Ranges, diameter: float, room: Room) -> Declarable:
     """Red cells in a cylinder, which is made smaller where they would be too many."""
     share, x, y = rng.uniform(*ranges.crowded), min(room.box[0], room.box[2]), room.box[1]
     count = share * math.pi / 4 * x**2 * y / evans_fung_cell(diameter).volume
@@ -188,7 +187,7 @@ def _crowd(rng: np.random.Generator, ranges: Ranges, diameter: float, room: Room
     return CrowdedCells(share, diameter, (smaller * x, smaller * y, smaller * x), rng.uniform(*ranges.deform))
 
 
-def _ellipsoids(rng: np.random.Generator, ranges: Ranges, diameter: float, room: Room) -> SpecimenKind:
+def _ellipsoids(rng: np.random.Generator, ranges: Ranges, diameter: float, room: Room) -> Declarable:
     """Solid, flattened by half at most: capsules of which the core is the shell's material."""
     count = min(MOST_BODIES, max(1, round(_log(rng, ranges.filled) * room.volume / (0.4 * diameter**3))))
     return Capsules(count, (0.6 * diameter, diameter), 0.1 * diameter, room.box, rng.uniform(0, 0.5))
@@ -196,7 +195,7 @@ def _ellipsoids(rng: np.random.Generator, ranges: Ranges, diameter: float, room:
 
 CORES: Mapping[Kind, float] = {"capsules": 0.0, "foam": 0.0, "ellipsoids": 1.0}
 """What is inside bodies with cores, as a share of the material's contrast."""
-SPECIMENS: Mapping[Kind, Callable[[np.random.Generator, Ranges, float, Room], SpecimenKind]] = {
+SPECIMENS: Mapping[Kind, Callable[[np.random.Generator, Ranges, float, Room], Declarable]] = {
     "red-cells": _cells,
     "crowd": _crowd,
     "ellipsoids": _ellipsoids,
@@ -255,7 +254,7 @@ def drawn_case(ranges: Ranges, seed: int, index: int) -> Case:
             declared = replace(declared, specimen=_fewer(declared.specimen))
 
 
-def _fewer(specimen: SpecimenKind) -> SpecimenKind:
+def _fewer(specimen: Declarable) -> Declarable:
     """The same with fewer bodies."""
     if isinstance(specimen, CrowdedCells):
         return replace(specimen, haematocrit=FEWER * specimen.haematocrit)

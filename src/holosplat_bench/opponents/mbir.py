@@ -1,18 +1,22 @@
-"""svmbir, another group's model-based reconstruction, as a tomography of `PerView`, where it is installed."""
+"""svmbir, another group's model-based reconstruction, after phase retrieval of each view, where it is installed."""
 
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
 from types import ModuleType
+from typing import ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from holosplat.baselines import TOMOGRAPHIES
+from holosplat.baselines import Tomography
 from holosplat.baselines.rays import bounded, in_pixels
 from holosplat.checks import MissingError, at_least, require
 from holosplat.geometry import Grid, Views
+from holosplat.methods import PerView
 from holosplat.progress import Advance
 from holosplat.projectors.voxels import rows_match
 from holosplat.ranges import Positive, Signed, checked_dataclass
@@ -51,7 +55,8 @@ def svmbir_volume(
     """Occupancy [Z, Y, X] on `grid` from thickness `lines` [V, H, W] in metres; float32; ≥ 0 unless `two_sided`.
 
     qGGMRF prior, multi-resolution coordinate descent (Bouman & Sauer 1996; svmbir). The views must turn about y only
-    and share one detector shift, the grid must be cubic, with the detector's rows and its middle on the rotation axis.
+    and share one pixel size and one detector shift; the grid must be cubic, with the detector's rows and its middle on
+    the rotation axis. Errors: `InputError` for others, `MissingError` where svmbir is not installed.
     """
     views.parallel("svmbir")
     program, pitch = _svmbir(), views.pixel_size
@@ -108,5 +113,10 @@ def _svmbir() -> ModuleType:
     return svmbir
 
 
-SVMBIR = "svmbir"
-TOMOGRAPHIES[SVMBIR] = svmbir_volume
+@dataclass(frozen=True)
+class MbirPerView(PerView):
+    """Phase retrieval of each view, then `svmbir_volume` with its usual options."""
+
+    tomographies: ClassVar[Mapping[str, Tomography]] = {"svmbir": svmbir_volume}
+
+    tomography: str = "svmbir"

@@ -21,7 +21,6 @@ from holosplat.matter import DeltaBeta
 from holosplat.ranges import Many, ManyOrNone, Metres, Small, checked_dataclass
 from holosplat.scan import interleaved_split
 from holosplat.specimens.continuous import ContinuousScene
-from holosplat.specimens.drawn import Scene, Substances
 from holosplat.specimens.matter import (
     Bodies,
     Capsules,
@@ -34,7 +33,7 @@ from holosplat.specimens.matter import (
     RedCells,
     SoftCells,
 )
-from holosplat.specimens.phantoms import Ball, star_of_balls
+from holosplat.specimens.phantoms import star_of_balls
 from holosplat.specimens.repair import closed
 from holosplat.specimens.soft_matter import body_with_absorber, coated_droplets, round_cell, shepp_logan, tissue
 from holosplat.tables import from_table, merged, read_table
@@ -222,15 +221,6 @@ class FileOfCase(Declaration):
 
     specimen: Specimen
     views: Interleaved | Between | Listed
-
-    def scene(self, seed: int, snapshots: Path | None) -> tuple[Scene, str, tuple[Ball, ...]]:
-        """As of any `Declaration`, and of matter that may fill the field."""
-        if not isinstance(self.specimen, FieldMatter):
-            return super().scene(seed, snapshots)
-        core = None if self.matter.core is None else self._delta_beta(self.matter.core)
-        material, medium = self._delta_beta(self.matter.material), self._delta_beta(self.matter.medium)
-        found = self.specimen.drawn(Substances(material, core, medium), seed)
-        return found.scene, found.text, ()
 
 
 def declared_names(path: Path) -> list[str]:
