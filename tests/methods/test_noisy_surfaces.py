@@ -10,17 +10,18 @@ import pytest
 import torch
 
 from helpers.bumpy import bumpy, surfaces
-from helpers.noisy_cells import CELLS, MATTER, PITCH, error, mesh_of, task_of
+from helpers.noisy_cells import CELLS, MATTER, PITCH, SHAPE, error, mesh_of, occupancy, task_of
 from holosplat.baselines import HolographicTV, holographic_tv
 from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
 from holosplat.fit.problem import Schedule
 from holosplat.geometry import Views
-from holosplat.inference import Decision
+from holosplat.inference import Decision, Score
 from holosplat.materials import HAEMOGLOBIN, WATER
 from holosplat.matter import MaterialPrior, Matter
 from holosplat.mesh import TriangleMesh
 from holosplat.methods import Gaussians, SurfaceOptions, Surfaces, Task
+from holosplat.methods import first_surfaces as first_surfaces_module
 from holosplat.methods.coarse import CoarseToFine, Way, begun_surfaces, first_of, missing_matter, settled
 from holosplat.methods.cross_validation import BY_FISSION, BY_VIEWS
 from holosplat.methods.first_surfaces import first_surfaces, is_noisy, surfaces_of_volume, with_missing_bodies
@@ -252,28 +253,58 @@ def test_where_none_is_missing_none_joins(noisy):
 
 
 def test_a_body_that_unseen_views_do_not_show_does_not_join(noisy, monkeypatch):
-    """Training frames may prefer one that makes up for their noise."""
+    """Training frames may prefer one that makes up for their noise. Folds have the frames' own pixels, for coarse ones
+    show no small body, and are scored by frames that they have not fitted."""
     monkeypatch.setattr("holosplat.methods.surfaces.begun_surfaces", lambda *given: None)
-    views, told = len(noisy.scan), list[Decision]()
+    monkeypatch.setattr("holosplat.methods.cross_validation.WIDTH", SHAPE[1] // 2)
+    views, own, told, seen = len(noisy.scan), BodiesStage._score, list[Decision](), list[set[bytes]]()
+
+    def frames(task: Task) -> set[bytes]:
+        return {frame.tobytes() for frame in task.scan.frames}
 
     def bodies(task: Task, *rest) -> tuple[float, SurfaceMesh]:
-        return 0.2, mesh_of(4 if len(task.scan) == views else 1)
+        assert task.scan.views.shape == SHAPE
+        if len(task.scan) < views:
+            seen.append(frames(task))
+        return 0.2, mesh_of(1 if len(task.scan) < views else 4)
+
+    def score(stage: BodiesStage, found: SurfaceMesh, task: Task) -> Score:
+        assert not seen or not frames(task) & seen[-1]
+        return own(stage, found, task)
 
     monkeypatch.setattr("holosplat.methods.surfaces.with_missing_bodies", bodies)
+    monkeypatch.setattr(BodiesStage, "_score", score)
     task = replace(noisy, on_start=lambda decision, guess: told.append(decision))
     found, _ = best_cut(task, 3)
     assert torch.equal(found.vertices, mesh_of(3).vertices)
     assert [each.choice for each in told[-2:]] == [MORE, "as found"]
+    assert seen
 
 
 def test_what_is_too_much_is_not_made_up_for_elsewhere(noisy):
-    """Beside bodies that are 1.15 times as large, whose residual is of both signs, additions alone are worse."""
+    """Beside bodies that are 1.15 times as large, whose residual is of both signs, none joins that makes them worse."""
     grown = [(body.vertices - body.vertices.mean(0)) * 1.15 + body.vertices.mean(0) for body in mesh_of().bodies()]
     bodies = zip(mesh_of().bodies(), grown)
     large = surfaces(*(replace(body, vertices=at / PITCH) for body, at in bodies), unit=PITCH)
     assert 0.4 < error(large) < 0.8
     made = with_missing_bodies(noisy, large, HOW, OPTIONS.coarse)
     assert made is None or error(made[1]) < 1.02 * error(settled(noisy, large, HOW, OPTIONS.coarse))
+
+
+def test_missing_bodies_are_additions_to_what_is_there(noisy, monkeypatch):
+    """The occupancy of the surfaces changes, which may fall, too; from nothing on it could not."""
+    given, own = list[torch.Tensor](), first_surfaces_module.sirt
+
+    def sirt(*arguments, start: torch.Tensor, **options) -> torch.Tensor:
+        given.extend((start, own(*arguments, start=start, **options)))
+        return given[-1]
+
+    monkeypatch.setattr(first_surfaces_module, "sirt", sirt)
+    with_missing_bodies(noisy, mesh_of(3), HOW, OPTIONS.coarse, (0.2,))
+    start, changed = given
+    assert torch.allclose(start, torch.from_numpy(occupancy(mesh_of(3))).float(), atol=1e-5)
+    assert 0 <= changed.min() <= changed.max() <= 1
+    assert (changed - start).min() < -0.1
 
 
 def test_where_no_body_keeps_a_voxel_there_are_none(noisy, monkeypatch):

@@ -228,10 +228,10 @@ def with_missing_bodies(
     cut these out; None where the frames show none.
 
     The thickness that explains what `found` leaves of the frames (`Correction`) changes its occupancy within 0 and 1,
-    by SIRT: what is too much is taken away where it is, and is not made up for by matter elsewhere. Where occupancy
-    is added, a body is missing; it has at least the volume of a voxel, and bodies with less after the steps are left
-    out. Few views and noise make it faint, so that `levels`, from the lowest on as long as less of the frames is left,
-    are shares of the largest addition.
+    by SIRT, so that what is too much may be taken away where it is, and need not be made up for elsewhere. Where
+    occupancy is added, a body is missing; it has at least the volume of a voxel, and bodies with less after the steps
+    are left out. Few views and noise make it faint, so that `levels`, from the lowest on as long as less of the frames
+    is left, are shares of the largest addition.
     """
     if not found.matter.single:
         return None
