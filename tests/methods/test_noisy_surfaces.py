@@ -327,11 +327,12 @@ def test_two_views_are_judged_by_data_fission(noisy, monkeypatch):
     assert torch.equal(found.vertices, mesh_of(4).vertices)
 
 
-def test_large_frames_get_none(noisy, monkeypatch):
+@pytest.mark.parametrize("count", [2, 4], ids=["that lack much", "that lack nothing"])
+def test_large_frames_get_none(noisy, count, monkeypatch):
     monkeypatch.setattr("holosplat.methods.surfaces.with_missing_bodies", lambda *given: pytest.fail("not asked for"))
     monkeypatch.setattr(BodiesStage, "_small", lambda *given: False)
-    found, _ = best_cut(noisy, 4)
-    assert torch.equal(found.vertices, mesh_of().vertices)
+    found, _ = best_cut(noisy, count)
+    assert torch.equal(found.vertices, mesh_of(count).vertices)
 
 
 def test_bodies_of_several_materials_get_none(noisy):
