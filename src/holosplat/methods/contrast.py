@@ -50,7 +50,7 @@ def decide_sign(first: FirstVolumes, *scores: Scoring) -> tuple[FirstVolumes, tu
             try:
                 return score(volumes[sign], fold, without)
             except InputError:  # there is no such matter, or no such light
-                return _without_matter(first, fold)
+                return without_matter(first, fold)
 
         beside = {other: (other + WITHOUT,)}
         return select(STAGE, (null, other), scored, first.folds.count, by=first.folds.by, beside=beside)
@@ -95,7 +95,7 @@ def decide_sides(
         try:
             return tried.score(name_of(taken) + without, fold)
         except InputError:  # there is no such matter
-            return _without_matter(first, fold)
+            return without_matter(first, fold)
 
     beside, by = {SPHERICAL: (SPHERICAL + WITHOUT, BALL), BOTH: (BOTH + WITHOUT,)}, first.folds.by
     decision = select(STAGE, tuple(trials), scored, first.folds.count, by=by, beside=beside)
@@ -116,7 +116,7 @@ def _refuted(volumes: Mapping[str, FirstVolumes], light: LightOptions, told: Hyp
         try:
             return tried[name].score(name_of(told), fold)
         except InputError:  # there is no such matter
-            return _without_matter(next(iter(volumes.values())), fold)
+            return without_matter(next(iter(volumes.values())), fold)
 
     null = next(iter(volumes))
     return select(STAGE, tuple(volumes), scored, by=BY_FISSION).choice != null
@@ -129,7 +129,8 @@ def both_sides(first: FirstVolumes) -> FirstVolumes:
     return FirstVolumes(first.folds, first.prior.on_both_sides(), first.on_progress, how)
 
 
-def _without_matter(first: FirstVolumes, fold: int) -> Score:
+def without_matter(first: FirstVolumes, fold: int) -> Score:
+    """The score of even light in a fold."""
     unseen = first.folds.split(fold)[1]
     return Score.of(unseen.left(torch.ones(unseen.frames.shape, dtype=torch.float64)))
 

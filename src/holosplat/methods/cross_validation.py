@@ -205,6 +205,12 @@ class FirstVolumes:
             self._material = assumed_material(self.folds.scan, self.prior, self.on_progress, self.options.backend)
         return self._material
 
+    def at_ratio(self, ratio: float) -> FirstVolumes:
+        """Volumes of the same folds, of one material of δ/β `ratio`."""
+        prior = self.prior.with_ratio(ratio)
+        material = assumed_material(self.folds.scan, prior, self.on_progress, self.options.backend)
+        return replace(self, _material=material, _made={})
+
     @property
     def _how(self) -> HolographicTV:
         return replace(self.options, two_sided=self.prior.two_sided)

@@ -28,7 +28,7 @@ from .contrast import STAGE as SIGN
 from .contrast import Scoring, decide_sides, decide_sign, with_sign
 from .cross_validation import BY_FISSION, EFFORT, FirstVolumes, predicted_frames
 from .ground import assumed_material
-from .levels import SHOWN, TrialFits, blind
+from .levels import SHOWN, TrialFits, at_ratio_of_one, blind
 from .method import Method, Task, first_of_task
 from .trials import UNEVEN, WITHOUT, Hypothesis, Trials, name_of, named, plain_light, rivals, with_more
 from .volume import SmoothVolume
@@ -150,9 +150,13 @@ def prepared(task: Task, method: Method | None = None, before: Prepared | None =
     ]
     told = tuple([UNEVEN] * (options.kind == "smooth"))
     if before is None:
+        spherical = isinstance(method, Auto | SmoothVolume)
+        free = spherical and not (task.prior.fixes_ratio or task.prior.two_sided or task.scan.is_series)
+        if free:  # light and noise would make up for a wrong δ/β, so they are compared after it
+            first, ratio = at_ratio_of_one(task, first)
+            task = replace(task, decisions=(*task.decisions, ratio))
         task.on_progress(STAGE, 0.0)
         first.taken, made = decided(first, options, told, tuple(open_to))
-        spherical = isinstance(method, Auto | SmoothVolume)
         if _may_have_both_sides(task, method) and (spherical or first.folds.by != BY_FISSION):
             first, sides = decide_sides(first, options, told, spherical)
             task = replace(task, prior=with_sign(task.prior, (sides,)), decisions=(*task.decisions, sides))

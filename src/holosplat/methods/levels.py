@@ -17,18 +17,19 @@ from torch import Tensor
 
 from ..baselines.tomography import plateau
 from ..baselines.two_materials import best_levels, eroded, told_apart
-from ..checks import NoMatterError
+from ..checks import InputError, NoMatterError
 from ..inference import Decision, Score, select
 from ..matter import MatterKind
 from ..representations import Stored, VoxelGrid
+from .contrast import without_matter
 from .cross_validation import BY_FISSION, EFFORT, FirstVolumes, predictions
 from .method import Method, Task, first_of_task, solve_stages
 from .trials import WITHOUT, Hypothesis, Trial, Trials, accepted, hypothesis_of, name_of
-from .uncertain import Determined, likeliest_ratio
+from .uncertain import LIKELY_RATIOS, Determined, likeliest_ratio
 
 STAGE = "levels or continuous matter"
 SHOWN = "matter in first volumes"
-NAME = "matter"
+NAME, RATIO = "matter", "δ/β"
 LEVELS = ("one level", "two levels")
 SEVERAL = "several levels"
 CONTINUOUS = "continuous"
@@ -139,7 +140,7 @@ class TrialFits:
         prior = task.prior
         if not (prior.fixes_ratio or two):
             known = task.lit is not None
-            ratio = ratio_of_one(task, self._first).value if known else self._first.material.ratio
+            ratio = ratio_of_one(task, self._first)[0].value if known else self._first.material.ratio
             prior = prior.with_ratio(ratio)
         fitted = replace(task, scan=seen, prior=prior, lit=trial.light, matter=kind, first=None)
         if fitted.bounded and not prior.materials and "continuous" in self._methods:
@@ -151,9 +152,41 @@ class TrialFits:
             return None
 
 
-def ratio_of_one(task: Task, first: FirstVolumes) -> Determined:
-    """δ/β where nothing is known and all matter has one: `likeliest_ratio`, found once for a task."""
-    return first.once("likeliest ratio", 0, lambda: likeliest_ratio(task))
+def ratio_of_one(task: Task, first: FirstVolumes) -> tuple[Determined, Decision]:
+    """δ/β where nothing is known and all matter has one, and its decision, made once for what was taken of light.
+
+    The null is the largest of `LIKELY_RATIOS`, of matter that absorbs least. The likeliest one (`likeliest_ratio`) is
+    taken where first volumes of such matter predict unseen frames better: what explains the fitted ones by absorption
+    may be whatever else the model lacks.
+    """
+    return first.once(("ratio", first.taken), 0, lambda: _ratio_of_one(task, first))
+
+
+def _ratio_of_one(task: Task, first: FirstVolumes) -> tuple[Determined, Decision]:
+    found = likeliest_ratio(task)
+    most = LIKELY_RATIOS[1]
+    tried = {f"{each.value:.4g}": each for each in (replace(found, value=most, high=most, told=False), found)}
+    volumes = {name: first.at_ratio(each.value) for name, each in tried.items()}
+
+    def scored(name: str, fold: int) -> Score:
+        light, (seen, unseen) = accepted(task, first, fold).light, first.folds.split(fold)
+        try:
+            volume = volumes[name].volume(fold, light)
+        except InputError:  # there is no such matter
+            return without_matter(first, fold)
+        return Trial(volume, light, seen, unseen, predictions(volume, unseen)).score(light)
+
+    decision = select(RATIO, tuple(tried), scored, first.folds.count, by=first.folds.by)
+    chosen = tried[decision.choice]
+    return (chosen if chosen is found else replace(chosen, remark=f"{decision.line}")), decision
+
+
+def at_ratio_of_one(task: Task, first: FirstVolumes) -> tuple[FirstVolumes, Decision]:
+    """The first volumes of a task of which nothing is known, of a material with `ratio_of_one`, and its decision."""
+    found = ratio_of_one(task, first)
+    there = first.at_ratio(found[0].value)
+    there.once(("ratio", first.taken), 0, lambda: found)
+    return there, found[1]
 
 
 def blind(decisions: Iterable[Decision]) -> bool:

@@ -269,7 +269,9 @@ class Search:
             _, hessian = self._slopes(at, step)
             shown = 0.5 * np.diag(hessian) * step**2 > SEEN * self._temperature()
             step = np.where(shown, step / 2, step)
-            at = self._moved(at, step)
+            before, at = at, self._moved(at, step)
+            if bool((np.abs(at - before) < self._systematic).all()):
+                break
         return at, step
 
     def _descended(self, at: np.ndarray, i: int, step: float) -> np.ndarray:
@@ -291,6 +293,12 @@ class Search:
             self.task.on_progress(STAGE, min(1.0, len(self._values) / self._planned))
             self._values[key] = self.profile(self._constants(at))
         return self._values[key]
+
+    @property
+    def _systematic(self) -> float:
+        """Standard error of each logarithm besides that of the likelihood; no search needs to be finer."""
+        several = 2 if len(self.names) > 1 else 1
+        return several * (SYSTEMATIC + NOISY * math.sqrt(self.profile.noise_share))
 
     def _temperature(self) -> float:
         """What a difference of the misfit is worth: one, and what fits that have not come to their end differ by."""
@@ -333,9 +341,7 @@ class Search:
 
     def _said(self, at: np.ndarray, hessian: np.ndarray) -> tuple[Determined, ...]:
         values, vectors = np.linalg.eigh(hessian / self._temperature())
-        several = 2 if len(at) > 1 else 1
-        systematic = (several * (SYSTEMATIC + NOISY * math.sqrt(self.profile.noise_share))) ** 2
-        known = (vectors / (1 / np.maximum(values, 1e-9) + systematic)) @ vectors.T
+        known = (vectors / (1 / np.maximum(values, 1e-9) + self._systematic**2)) @ vectors.T
         covariance = np.linalg.inv(known + np.diag(self.half**-2))
         likeliest, at = at, self.middle + covariance @ known @ (at - self.middle)
         error, tried = np.sqrt(np.diag(covariance)), self._about_as_likely()
