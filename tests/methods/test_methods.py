@@ -62,7 +62,7 @@ LEAST = {"neural-field": 0.4, "pixelnerf": 0.4, "paganin-sirt": 0.3, "paganin-fb
 """Correlation of held-out frames: after few steps, or without fringes and with streaks, it is small but there."""
 LEAST_BY_RATIO = {**LEAST, "gaussians": 0.5, "surfaces": 0.7, "onix": 0.85}
 """δ is estimated at 0.6 of the balls' there, by which overfull Gaussians lose matter in their first steps."""
-REPEATED = {"surfaces": "known"}
+REPEATED = {"surfaces": "known", "auto": "ratio"}
 """With which prior a method runs twice, where that is not `unknown`."""
 KNOWN = MaterialPrior.known(ONE.channels[0])
 PRIORS = {"known": KNOWN, "ratio": MaterialPrior.of_ratio(ONE.channels[0].ratio), "unknown": MaterialPrior.unknown()}
