@@ -66,8 +66,8 @@ def test_rounds_of_agreement_in_noise_are_more_and_smoother():
     assert replace(usual, weight=2.0).in_noise().weight == 2.0
 
 
-def test_a_volume_that_agrees_with_noisy_frames_is_nearer_to_the_truth(noisy):
-    errors = list[float]()
+def test_a_volume_that_agrees_with_noisy_frames_is_nearer_to_the_truth():
+    noisy, errors = task_of(1000.0), list[float]()
     for how in (HolographicTV(), HolographicTV().in_noise()):
         found, _ = holographic_tv(noisy.scan, MATTER, replace(how, refine=1), quiet)
         errors.append(error(found.numpy()))
