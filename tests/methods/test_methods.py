@@ -36,12 +36,14 @@ from holosplat.methods import (
     Voxels,
     solve,
 )
+from holosplat.methods.coarse import CoarseToFine
 from holosplat.model import Instrument, Model
 from holosplat.representations import KINDS, AlignedNetwork, Stored
 from holosplat.scan import Scan
 
 VOLUME = HolographicTV(iterations=30, corrections=1, inner=5, refine=1)
-GAUSSIANS = Gaussians(volume=VOLUME, approximate_steps=10, fit=FitOptions(schedule=Schedule(steps=10)))
+COARSE = CoarseToFine(coarse_steps=4, views=1, turns=1)
+GAUSSIANS = Gaussians(volume=VOLUME, approximate_steps=10, fit=FitOptions(schedule=Schedule(steps=10)), coarse=COARSE)
 NEURAL = NeuralFit(NETWORK, 20, 1000, rate=0.05, probes=100, schedule=Schedule(steps=4, views_per_step=2, decay=0.05))
 ALIGNED = AlignedFit(network=AlignedNetwork((4, 6), 8, 2), rate=0.05, schedule=Schedule(steps=25))
 QUICK: dict[str, Method] = {
