@@ -135,8 +135,7 @@ def nothing_missing(monkeypatch):
 
 EXPLAINED = replace(OPTIONS, coarse=replace(OPTIONS.coarse, missing_matter=0.3))
 """What so few noisy pixels tell."""
-LONGER = replace(EXPLAINED, coarse=replace(EXPLAINED.coarse, coarse_steps=20))
-"""With steps enough for a body to grow from what others leave."""
+LONGER = replace(EXPLAINED, coarse=replace(EXPLAINED.coarse, coarse_steps=20))  # a body grows from what others leave
 
 
 def best_cut(task: Task, count: int, options: Gaussians = EXPLAINED) -> tuple[SurfaceMesh, int]:
@@ -356,8 +355,7 @@ def rods(radius: float) -> tuple[Task, SurfaceMesh]:
     scene = MeshScene.of_one_material([replace(one, vertices=1e-6 * one.vertices) for one in meshes], matter)
     exposures = Exposures.of(Views.evenly_spaced(8, (33, 46), 1e-6), 20.0, 0.1)
     scan = simulate(scene, exposures, photons_per_pixel=1e5, seed=1, is_test=np.zeros(8, dtype=bool))
-    even = LightOptions("even", noise="white")
-    return prepared(Task(scan, MaterialPrior.known(matter), light=even)), true
+    return prepared(Task(scan, MaterialPrior.known(matter), light=LightOptions("even", noise="white"))), true
 
 
 @pytest.mark.parametrize("radius", [1.1, 3.0], ids=["thin", "thick"])
@@ -397,6 +395,6 @@ def test_surfaces_of_the_volume_explain_noisy_frames(noisy):
 def test_a_run_ends_with_them(noisy, unjudged_runs):
     """Gaussians of five steps explain nothing."""
     method = Surfaces(fit=HOW.fit, gaussians=OPTIONS)
-    found = reconstruct(noisy.scan, noisy.prior, method, light=noisy.light, matter="levels")
-    assert isinstance(found.object, SurfaceMesh)
-    assert error(found.object) < 0.25
+    found = reconstruct(noisy.scan, noisy.prior, method, light=noisy.light, matter="levels").object
+    assert isinstance(found, SurfaceMesh)
+    assert error(found) < 0.25
