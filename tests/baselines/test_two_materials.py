@@ -27,6 +27,7 @@ from holosplat.methods.presets import preset
 from holosplat.methods.start import starting_cloud
 from holosplat.methods.surface_fit import extract_surfaces
 from holosplat.model import Instrument, measure
+from holosplat.optics.background import LightOptions
 from holosplat.representations import GaussianCloud, VoxelLines, approximate, cloud_from_shares
 from holosplat.representations.gaussians import raw_of
 from holosplat.scan import Exposures, Scan
@@ -44,6 +45,7 @@ SILICA = Compound("SiO2", 2.2).delta_beta(20.0)
 OIL = Compound("C16H34", 0.77).delta_beta(20.0)
 BOTH = (SILICA, OIL)
 PRIOR = MaterialPrior.known(OIL, SILICA)
+EVEN = LightOptions("even", noise="white")
 pytestmark = pytest.mark.usefixtures("begun_once", "unjudged_runs")
 
 
@@ -281,7 +283,7 @@ def test_two_materials_are_found_where_nothing_is_known(scan, truth):
 
 
 def test_two_known_materials_are_taken_as_they_are(scan, truth):
-    found = reconstruct(scan, PRIOR, settings(refine=1))
+    found = reconstruct(scan, PRIOR, settings(refine=1), light=EVEN)
     assert found.object.matter.channels == BOTH
     scores = evaluate(found, scan, truth)
     assert scores.volume.relative_error_delta < 0.18
@@ -322,9 +324,9 @@ def test_a_run_of_two_materials_is_resumed_as_one(scan, tmp_path):
             raise KeyboardInterrupt
 
     whole, parts = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "parts")
-    expected = reconstruct(scan, PRIOR, QUICK, folder=whole).object
-    assert not reconstruct(scan, PRIOR, QUICK, folder=parts, on_progress=stop).finished
-    reconstruct(scan, PRIOR, QUICK, folder=parts, resume=True)
+    expected = reconstruct(scan, PRIOR, QUICK, light=EVEN, folder=whole).object
+    assert not reconstruct(scan, PRIOR, QUICK, light=EVEN, folder=parts, on_progress=stop).finished
+    reconstruct(scan, PRIOR, QUICK, light=EVEN, folder=parts, resume=True)
     found = load_reconstruction(parts).object
     assert found.matter.channels == BOTH
     for name, p in expected.parameters().items():

@@ -21,9 +21,10 @@ pytestmark = pytest.mark.usefixtures("unjudged_runs")
 
 START = ["volume.retrieval=20", "volume.iterations=30", "volume.corrections=2", "volume.inner=8", "volume.refine=1"]
 CLOUD = [*START, "spacing_px=2", "approximate_steps=5", "fit.schedule.steps=30"]
+COARSE = ["coarse.coarse_steps=4", "coarse.views=1", "coarse.turns=1"]
 QUICK: dict[str, list[str]] = {
     "gaussians": CLOUD,
-    "surfaces": [*(f"gaussians.{change}" for change in CLOUD), "fit.schedule.steps=6"],
+    "surfaces": [*(f"gaussians.{change}" for change in (*CLOUD, *COARSE)), "fit.schedule.steps=6"],
     "voxels": [*START, "fit.steps=6", "fit.coarse_steps=4"],
     "neural-field": [*START, "fit.warmup_steps=30", "fit.warmup_rays=512", "fit.probes=256", "fit.schedule.steps=4"],
     "holographic-tv": START,

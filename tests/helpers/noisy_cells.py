@@ -19,16 +19,16 @@ from holosplat.scan import Exposures, Scan
 from holosplat.specimens import random_cells
 from holosplat.specimens.scene import MeshScene
 
-PITCH, SHAPE = 3.2e-6, (41, 55)
+PITCH, SHAPE = 4.2e-6, (31, 42)
 MATTER = HAEMOGLOBIN.delta_beta(20.0)
-CELLS = random_cells(4, (40 * PITCH, 36 * PITCH, 40 * PITCH), 5, 18 * PITCH)
+CELLS = random_cells(4, (30.5 * PITCH, 27.4 * PITCH, 30.5 * PITCH), 5, 13.7 * PITCH)
 
 
 def scan_of(photons: float) -> Scan:
-    """Sixteen views of cells of 18 pixels."""
+    """Sixteen views of cells of 14 pixels."""
     scene = MeshScene.of_one_material(CELLS, MATTER)
     views = Views.evenly_spaced(16, SHAPE, PITCH)
-    exposures = Exposures.of(views, 20.0, 0.1, 0.05)
+    exposures = Exposures.of(views, 20.0, 0.17, 0.05)
     return simulate(scene, exposures, photons_per_pixel=photons, seed=1, is_test=np.zeros(16, dtype=bool))
 
 

@@ -30,6 +30,7 @@ from holosplat.methods.start import cloud_of_surfaces
 from holosplat.methods.surface_fit import SurfaceFit, oversampling
 from holosplat.methods.surfaces import refine_surfaces
 from holosplat.model import measure
+from holosplat.optics.background import LightOptions
 from holosplat.optics.sampling import fringe_sampling
 from holosplat.projectors.surface import surface_occupancy
 from holosplat.representations import GaussianCloud, SurfaceMesh
@@ -41,6 +42,8 @@ from holosplat.workflows.run_folder import RunFolder
 PITCH = 0.5e-6
 QUICK = CoarseToFine(columns=32, coarse_steps=15, last_steps=10, views=1, fit_steps=3)
 MATTER = HAEMOGLOBIN.delta_beta(20.0)
+EVEN = LightOptions("even", noise="white")
+"""What light decides is for other tests."""
 
 
 def body(radius: float = 20.0, centre=(1.2, -0.8, 0.6)) -> TriangleMesh:
@@ -68,7 +71,7 @@ def quick(coarse: CoarseToFine = QUICK) -> Gaussians:
 
 
 def task_of(scan: Scan) -> Task:
-    return prepared(Task(scan, MaterialPrior.known(MATTER)))
+    return prepared(Task(scan, MaterialPrior.known(MATTER), light=EVEN))
 
 
 def dice(found, *true: TriangleMesh) -> float:
@@ -251,16 +254,16 @@ def test_a_run_goes_on_from_a_near_start_with_as_few_steps(scan, near, tmp_path,
     folder, prior = RunFolder(tmp_path / "run"), MaterialPrior.known(MATTER)
     method = Surfaces(gaussians=quick())
     monkeypatch.setattr(GaussianStage, "coarse_surfaces", lambda stage, task, how: near[0])
-    whole = reconstruct(scan, prior, method, matter="levels")
+    whole = reconstruct(scan, prior, method, light=EVEN, matter="levels")
 
     def stop(stage, part, record):
         if stage == "surfaces" and record.get("step") == 4:
             raise KeyboardInterrupt
 
-    cut = reconstruct(scan, prior, method, matter="levels", folder=folder, on_progress=stop)
+    cut = reconstruct(scan, prior, method, light=EVEN, matter="levels", folder=folder, on_progress=stop)
     assert not cut.finished
     monkeypatch.delattr(GaussianStage, "coarse_surfaces")
-    again = reconstruct(scan, prior, method, matter="levels", folder=folder, resume=True)
+    again = reconstruct(scan, prior, method, light=EVEN, matter="levels", folder=folder, resume=True)
     assert again.finished
     assert isinstance(again.object, SurfaceMesh)
     assert isinstance(whole.object, SurfaceMesh)

@@ -115,7 +115,7 @@ def total_of(total: TotalMatter) -> float:
     return total.value
 
 
-def test_light_that_a_medium_dims_is_no_matter(bubbles):
+def test_light_that_a_medium_dims_is_no_matter(bubbles, unjudged_runs):
     """Frames over flat fields without the water: its even absorption is in no difference, and counts as light."""
     scan = of(bubbles)
     truth = bubbles.voxelise(Grid.of_views(scan.views))

@@ -29,12 +29,12 @@ from holosplat.specimens.soft_matter import soft_cells
 from holosplat.workflows.run_illumination import EVEN, light_options_of
 
 MATTER = DeltaBeta(4e-7, 4e-7 / 1500)
-PIXEL, SHAPE, VIEWS = 1e-6, (45, 52), 8
+PIXEL, SHAPE, VIEWS = 1.5e-6, (31, 36), 8
 PRIOR = MaterialPrior.of_ratio(MATTER.ratio)
 
 
 def of(scene, photons: float | None = None) -> Scan:
-    exposures = Exposures.of(Views.evenly_spaced(VIEWS, SHAPE, PIXEL), 20.0, 0.1)
+    exposures = Exposures.of(Views.evenly_spaced(VIEWS, SHAPE, PIXEL), 20.0, 0.2)
     return simulate(scene, exposures, photons_per_pixel=photons, seed=3, is_test=np.zeros(VIEWS, dtype=bool))
 
 

@@ -32,13 +32,15 @@ from holosplat.specimens.soft_matter import soft_cells
 pytestmark = pytest.mark.usefixtures("begun_once")
 
 MATERIAL = DeltaBeta(4e-7, 4e-7 / 1500)
-PIXEL, SHAPE = 1e-6, (45, 52)  # rectangular, and odd
+PIXEL, SHAPE = 1.4e-6, (33, 38)  # rectangular, and odd
 RATIO = MaterialPrior.of_ratio(MATERIAL.ratio)
 
 
-def measured(scene, photons: float | None = None) -> Scan:
-    exposures = Exposures.of(Views.evenly_spaced(9, SHAPE, PIXEL), 20.0, 0.1)
-    return simulate(scene, exposures, photons_per_pixel=photons, seed=3, is_test=np.zeros(9, dtype=bool))
+def measured(scene, fine: bool = False) -> Scan:
+    """fine: on pixels of 1 µm, with as wide fringes in them."""
+    shape, pixel, distance = ((45, 52), 1e-6, 0.1) if fine else (SHAPE, PIXEL, 0.2)
+    exposures = Exposures.of(Views.evenly_spaced(9, shape, pixel), 20.0, distance)
+    return simulate(scene, exposures, is_test=np.zeros(9, dtype=bool))
 
 
 def decided(task: Task) -> str:
@@ -71,7 +73,7 @@ def test_two_levels_are_levels_where_two_materials_may_be_found():
     cells = random_cells(4, (40e-6, 38e-6, 40e-6), 5, 17e-6)
     dense, light = MATERIAL, DeltaBeta(0.45 * MATERIAL.delta, 0.45 * MATERIAL.beta)
     scene = MeshScene(cells, [dense, light, dense, light])
-    scan = measured(scene)
+    scan = measured(scene, fine=True)
     assert decide_matter(Task(scan, MaterialPrior.unknown())).choice in LEVELS
     assert decide_matter(Task(scan, RATIO)).choice == CONTINUOUS
 
@@ -246,7 +248,7 @@ def test_the_kind_that_is_told_is_taken(sharp):
 
 
 def test_auto_takes_bodies_for_levels_and_a_volume_for_a_continuum(soft, sharp):
-    auto = Auto()
+    auto = Auto().with_effort(0.3)
     assert settled(auto, Task(soft, RATIO)).method is auto.volume
     assert settled(auto, Task(sharp, RATIO)).method.kind == "bodies"
 

@@ -36,12 +36,14 @@ from holosplat.methods import (
     Voxels,
     solve,
 )
+from holosplat.methods.coarse import CoarseToFine
 from holosplat.model import Instrument, Model
 from holosplat.representations import KINDS, AlignedNetwork, Stored
 from holosplat.scan import Scan
 
 VOLUME = HolographicTV(iterations=30, corrections=1, inner=5, refine=1)
-GAUSSIANS = Gaussians(volume=VOLUME, approximate_steps=10, fit=FitOptions(schedule=Schedule(steps=10)))
+COARSE = CoarseToFine(coarse_steps=4, views=1, turns=1)
+GAUSSIANS = Gaussians(volume=VOLUME, approximate_steps=10, fit=FitOptions(schedule=Schedule(steps=10)), coarse=COARSE)
 NEURAL = NeuralFit(NETWORK, 20, 1000, rate=0.05, probes=100, schedule=Schedule(steps=4, views_per_step=2, decay=0.05))
 ALIGNED = AlignedFit(network=AlignedNetwork((4, 6), 8, 2), rate=0.05, schedule=Schedule(steps=25))
 QUICK: dict[str, Method] = {
@@ -62,7 +64,7 @@ LEAST = {"neural-field": 0.4, "pixelnerf": 0.4, "paganin-sirt": 0.3, "paganin-fb
 """Correlation of held-out frames: after few steps, or without fringes and with streaks, it is small but there."""
 LEAST_BY_RATIO = {**LEAST, "gaussians": 0.5, "surfaces": 0.7, "onix": 0.85}
 """δ is estimated at 0.6 of the balls' there, by which overfull Gaussians lose matter in their first steps."""
-REPEATED = {"surfaces": "known"}
+REPEATED = {"surfaces": "known", "auto": "ratio"}
 """With which prior a method runs twice, where that is not `unknown`."""
 KNOWN = MaterialPrior.known(ONE.channels[0])
 PRIORS = {"known": KNOWN, "ratio": MaterialPrior.of_ratio(ONE.channels[0].ratio), "unknown": MaterialPrior.unknown()}

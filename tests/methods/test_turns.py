@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch.nn.functional import avg_pool3d
 
-from helpers.noisy_cells import MATTER, PITCH, error, mesh_of, occupancy, task_of
+from helpers.noisy_cells import MATTER, PITCH, SHAPE, error, mesh_of, occupancy, task_of
 from holosplat.baselines import HolographicTV
 from holosplat.baselines.holographic_tv import agreed
 from holosplat.checks import InputError
@@ -34,7 +34,7 @@ def volume_of(task: Task, count: int) -> torch.Tensor:
     """What agrees with the frames, begun with so many cells."""
     start = torch.as_tensor(occupancy(mesh_of(count)), dtype=torch.float32)
     found, grid = agreed(task.scan, MATTER, start, HolographicTV().in_noise(), quiet)
-    assert grid.shape == tuple(start.shape) == (55, 41, 55)
+    assert grid.shape == tuple(start.shape) == (SHAPE[1], *SHAPE)
     return found
 
 
@@ -47,7 +47,7 @@ def test_rounds_that_begin_without_a_cell_find_most_of_it(noisy):
 
 
 def test_rounds_that_begin_with_the_truth_stay_with_it(noisy):
-    from_nothing = torch.zeros(55, 41, 55)
+    from_nothing = torch.zeros(SHAPE[1], *SHAPE)
     found, _ = agreed(noisy.scan, MATTER, from_nothing, HolographicTV().in_noise(), quiet)
     assert error(volume_of(noisy, 4).numpy()) < min(0.3, error(found.numpy()))
 

@@ -31,14 +31,14 @@ from holosplat.specimens.red_cells import random_cells
 
 WATER = DeltaBeta(5.75e-7, 2.56e-10)
 DENSE, THIN = DeltaBeta(0.4 * WATER.delta, 0.4 * WATER.beta), DeltaBeta(-WATER.delta, -WATER.beta)
-PIXEL, SHAPE, VIEWS = 1e-6, (33, 41), 9
+PIXEL, SHAPE, VIEWS = 1.25e-6, (27, 33), 9
 
 
-FINE, COARSE = Views.evenly_spaced(VIEWS, SHAPE, PIXEL), Views.evenly_spaced(5, (15, 19), 2 * PIXEL)
+FINE, COARSE = Views.evenly_spaced(VIEWS, SHAPE, PIXEL), Views.evenly_spaced(5, (15, 19), 2e-6)
 
 
 def of(scene, photons: float | None = None, views: Views = FINE) -> Scan:
-    exposures, held_out = Exposures.of(views, 20.0, 0.1), np.zeros(len(views), dtype=bool)
+    exposures, held_out = Exposures.of(views, 20.0, 0.15), np.zeros(len(views), dtype=bool)
     return hs.simulate(scene, exposures, photons_per_pixel=photons, seed=3, is_test=held_out)
 
 

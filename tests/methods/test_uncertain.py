@@ -11,7 +11,7 @@ import torch
 
 from helpers.blobs import MATERIAL as BLOBS
 from helpers.blobs import SHAPE, blob_scan
-from helpers.soft import MATERIAL, two_cells
+from helpers.soft import DISTANCE, MATERIAL, PIXEL, two_cells
 from holosplat.baselines import HolographicTV
 from holosplat.baselines.beyond import rows_beyond
 from holosplat.baselines.material import estimate_ratio
@@ -40,15 +40,15 @@ QUICK = ProfileOptions(
 
 @pytest.fixture(scope="module")
 def scan():
-    """Two soft cells in five views of 41 × 45 pixels at 20 keV and 0.05 m, without noise."""
+    """Two soft cells in five views of 31 × 35 pixels at 20 keV, without noise."""
     return two_cells(5)
 
 
 def test_a_distance_is_found_within_its_range(scan):
-    (found,) = determine(Task(scan, RATIO), Uncertain(distance=(0.04, 0.09)), QUICK)
+    (found,) = determine(Task(scan, RATIO), Uncertain(distance=(0.8 * DISTANCE, 1.8 * DISTANCE)), QUICK)
     assert found.told
-    assert found.low < 0.05 < found.high
-    assert found.value == pytest.approx(0.05, rel=0.15)
+    assert found.low < DISTANCE < found.high
+    assert found.value == pytest.approx(DISTANCE, rel=0.15)
     assert "by the frames" in found.line()
 
 
@@ -241,7 +241,7 @@ def test_one_energy_holds_unless_frames_are_predicted_better_with_a_bandwidth(ga
 
 def test_frames_set_aside_are_predicted_by_a_volume_of_the_others(scan):
     """Without a blur, as they are, better than with one of four pixels."""
-    at = {"distance": 0.05, "delta_beta": MATERIAL.ratio}
+    at = {"distance": DISTANCE, "delta_beta": MATERIAL.ratio}
     profile = Profile(Task(scan, RATIO), MATERIAL.ratio, at, [at], replace(QUICK, iterations=3))
     unseen = np.array([False, False, True, False, False])
     true, wrong = profile.score(at, unseen), profile.score(at | {"psf_sigma_px": 4.0}, unseen)
@@ -250,10 +250,10 @@ def test_frames_set_aside_are_predicted_by_a_volume_of_the_others(scan):
 
 
 def test_widths_of_light_and_detector_are_those_of_the_exposures(scan):
-    """A source of 1 mrad at 0.05 m blurs by 50 µm; a detector's blur is in pixels of the scan."""
-    seen = exposed(scan, {"bandwidth": 0.03, "psf_sigma_px": 3.0, "source_angle": 8e-5}).exposures
+    """A source blurs by its angle times the distance; a detector's blur is in pixels of the scan."""
+    seen = exposed(scan, {"bandwidth": 0.03, "psf_sigma_px": 3.0, "source_angle": 4 * PIXEL / DISTANCE}).exposures
     assert seen.bandwidth == pytest.approx(np.full(5, 0.03))
-    assert seen.psf_sigma_px == pytest.approx(np.full(5, 5.0))  # pixels of 1 µm: √(3² + 4²)
+    assert seen.psf_sigma_px == pytest.approx(np.full(5, 5.0))  # √(3² + 4²)
     at = {"delta_beta": MATERIAL.ratio}
-    binned = Profile(Task(scan, RATIO), MATERIAL.ratio, at, [at], replace(QUICK, width=23))
+    binned = Profile(Task(scan, RATIO), MATERIAL.ratio, at, [at], replace(QUICK, width=18))
     assert binned.frames({"psf_sigma_px": 3.0}).train.exposures.psf_sigma_px == pytest.approx(np.full(5, 1.5))

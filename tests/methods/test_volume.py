@@ -78,8 +78,8 @@ def test_noise_of_half_the_contrast_keeps_the_mass(quiet):
 @pytest.mark.parametrize("seed", [1, 3])
 def test_noise_wipes_nothing_out(seed):
     """Neither the start nor the fit loses the mass of a round cell in noise of three quarters of its contrast."""
-    exposures = Exposures.of(Views.evenly_spaced(8, (37, 40), PIXEL), 20.0, 0.03)
-    cell = round_cell(30 * PIXEL, MATERIAL, seed=2)
+    exposures = Exposures.of(Views.evenly_spaced(8, (28, 31), PIXEL), 20.0, 0.05)
+    cell = round_cell(30e-6, MATERIAL, seed=2)
     scan = simulate(cell, exposures, is_test=np.zeros(8, dtype=bool))
     scan = noisy(scan, 0.75 * float(np.sqrt(np.square(scan.frames - 1).mean())), seed)
     start = SmoothStage(SmoothVolume()).start(Task(scan, RATIO), None)
@@ -276,7 +276,7 @@ def test_a_fit_in_steps_is_one_descent_after_another(quiet, sigma, faint, monkey
     assert [record["step"] for record in records] == list(range(1, whole.step + 1))
     assert whole.finished
     assert whole.share == pytest.approx(1.0)
-    for stop in (1, 7, 10):
+    for stop in (1, whole.step // 2, whole.step - 1):
         first = SmoothStage(options).fit(task, start)
         first.run(lambda record: None, until=stop)
         assert not first.finished
@@ -292,7 +292,7 @@ def test_an_interrupted_fit_gives_what_it_has_reached(quiet):
     task = Task(noisy(quiet, 0.02, 1), RATIO)
     start = SmoothStage(SmoothVolume()).start(task, None)
     fit = SmoothStage(SmoothVolume()).fit(task, start)
-    fit.run(lambda record: None, until=90)
+    fit.run(lambda record: None, until=130)
     assert 0 < fit.share < 1
     assert fit.voxels.grid == start.grid
     assert judged(fit.voxels, quiet)[0] < judged(start, quiet)[0]
@@ -300,7 +300,7 @@ def test_an_interrupted_fit_gives_what_it_has_reached(quiet):
 
 def test_large_frames_are_binned(quiet):
     assert binning(quiet, 10**9) == 1
-    assert quiet.binned(binning(quiet, 20_000)).views.shape == (20, 22)
+    assert quiet.binned(binning(quiet, 10_000)).views.shape == (15, 17)
 
 
 def test_effort_is_a_share_of_the_iterations():

@@ -113,7 +113,7 @@ def test_nothing_is_left_out_where_it_would_save_little_or_tells_something():
 
 def test_a_task_looks_at_windows_only_in_even_light_and_known_poses():
     scan = frames("one axis")
-    task = Task(scan, MaterialPrior.known(MATERIAL))
+    task = Task(scan, MaterialPrior.known(MATERIAL), light=LightOptions("even", noise="white"))
     assert task.in_windows() is task, "its light was not looked at"
     task = prepared(task)
     part = task.in_windows()

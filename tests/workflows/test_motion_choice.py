@@ -17,6 +17,7 @@ from holosplat.inference import Decision
 from holosplat.io.nxtomo import write_scan
 from holosplat.io.volumes import read_volume
 from holosplat.methods import Auto
+from holosplat.optics.background import LightOptions
 from holosplat.specimens.phantoms import Ball
 from holosplat.specimens.red_cells import random_cells
 from holosplat.specimens.scene import MeshScene
@@ -78,7 +79,8 @@ def truth() -> MeshScene:
 
 def test_matter_that_changes_is_taken_time_by_time():
     """Other cells at every second time; without flow and bodies, which take long."""
-    decision = choose_motion(moving(6, (1, 4, 1, 4, 1, 4)), known(20.0), QUICK, matter="levels")
+    even = LightOptions("even", noise="white")
+    decision = choose_motion(moving(6, (1, 4, 1, 4, 1, 4)), known(20.0), QUICK, light=even, matter="levels")
     assert decision.choice == "each"
     assert decision.compared[0].loses
 
@@ -134,10 +136,11 @@ def asked(scan, tmp_path):
     write_scan(tmp_path / "scan.nxs", scan)
     (tmp_path / "quick.json").write_text(json.dumps({"method": to_table(QUICK)}), encoding="utf-8")
     said = ["reconstruct", tmp_path / "scan.nxs", "--motion", "auto", "--material", "haemoglobin", "--matter", "levels"]
+    said += ["--decide", "light=even", "noise=white"]
     return [*said, "--config", tmp_path / "quick.json", "--out", tmp_path / "out"]
 
 
-@pytest.mark.usefixtures("unjudged_runs")
+@pytest.mark.usefixtures("unjudged_runs", "undrawn_reports")
 @pytest.mark.parametrize("motion", ["still", "each"])
 def test_the_command_takes_what_was_chosen_says_of_each_time_and_goes_on(asked, motion, tmp_path, monkeypatch):
     """Which is kept with the folder, so that a run goes on without a decision, and stands on its page."""

@@ -53,7 +53,7 @@ def test_the_weights_that_noise_and_views_make_are_kept(tmp_path, photons):
 @pytest.mark.usefixtures("unjudged_runs")
 def test_a_prior_that_knows_no_level_leaves_its_terms_out(tmp_path):
     folder = RunFolder(tmp_path / "run")
-    reconstruct(scan(None), MaterialPrior.unknown(), QUICK, folder=folder)
+    reconstruct(scan(None), MaterialPrior.unknown(), QUICK, matter="levels", folder=folder)
     config = json.loads(folder.config.read_text())
     assert not {"overfull", "two_levels"} & set(config["resolved"]["fit"])
     assert config["method"]["fit"]["objective"]["overfull"] == QUICK.fit.objective.overfull

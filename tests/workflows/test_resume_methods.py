@@ -39,6 +39,7 @@ from holosplat.methods import (
     VoxelFit,
     Voxels,
 )
+from holosplat.methods.coarse import CoarseToFine
 from holosplat.representations import AlignedNetwork, NeuralField
 from holosplat.scan import Exposures, Scan
 from holosplat.volume import Object
@@ -51,6 +52,7 @@ CLOUD = Gaussians(
     approximate_steps=5,
     volume=VOLUME,
     fit=FitOptions(Objective(tv_volume=0.05, overfull=10.0), Schedule(steps=12)),
+    coarse=CoarseToFine(coarse_steps=2, views=1, turns=1),
 )
 SURFACES = SurfaceFit(schedule=Schedule(steps=6, decay=0.1, views_per_step=2))
 VOXELS = VoxelFit(coarse_steps=5, steps=7)

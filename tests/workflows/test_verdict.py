@@ -203,6 +203,7 @@ def test_runs_carry_their_verdict(tmp_path, scan):
 def test_strict_runs_end_with_3_where_frames_are_not_explained(tmp_path):
     """Uneven light: with --strict 3; without, when the finished run is resumed, a warning and 0. Even light: 0."""
     method = ["--method", "holographic-tv", "--delta-beta", f"{MATERIAL[0] / MATERIAL[1]:.0f}"]
+    method += ["--matter", "continuous", "--decide", "light=even", "noise=white"]
     even = a_scan(soft(3.0))
     modes = smooth_modes(SHAPE, 3)
     light = torch.einsum("vk,khw->vhw", 0.02 * torch.randn(8, 16, generator=torch.Generator().manual_seed(1)), modes)
