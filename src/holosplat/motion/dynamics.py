@@ -41,6 +41,8 @@ ALIKE = 0.3
 """A body whose volume differs from the median by more is no whole cell."""
 STRETCHED = 1.15
 """Area of a cell over that of a resting one of its volume, at most: membranes tear at less, and tracks are rough."""
+LEAST_OWN = 1e-4
+"""Of a forecast's squared error, which is its own at least."""
 PEAK = 0.04
 """How far the peak may be from that which the bodies' velocities say, as a share."""
 
@@ -211,28 +213,29 @@ class HybridForecast:
 
 
 def pooled(found: Sequence[Forecast], history: History) -> Forecast:
-    """The mean of forecasts at the same times, each body's by the inverse squares of the errors that they state.
+    """The mean of forecasts at the same times, that of least variance for each body by the errors that they state.
 
-    The error of the state that all begin with is in each: beyond it their errors count as independent. Bodies keep the
-    mean of the volumes, too.
+    The error of the state that all begin with is in each; beyond it errors are independent, and count by their inverse
+    squares. Bodies keep the mean of the volumes, too.
     """
-    times = np.r_[history.times[-1], found[0].times]
-    square = np.stack([one.band for one in found]) ** 2
-    weights = 1 / np.maximum(np.where(np.isnan(square), np.inf, square), np.finfo(float).tiny)
-    weights = np.where(weights.sum(0) > 0, weights, 1.0)
-    weights /= weights.sum(0)
-    state = np.zeros(history.bodies.count)
+    times, bodies = np.r_[history.times[-1], found[0].times], history.bodies
+    state = np.zeros(bodies.count)
     if history.halves is not None:
-        (state,) = half_apart(history.bodies, *(places_of(half, times[:1]) for half in history.halves))
-    own = np.maximum(square - state**2, 0.0)
-    band = np.sqrt(np.minimum(square.max(0), state**2 + np.where(weights > 0, weights**2 * own, 0.0).sum(0)))
+        (state,) = half_apart(bodies, *(places_of(half, times[:1]) for half in history.halves))
+    square = np.stack([one.band for one in found]) ** 2
+    own = np.maximum(square - state**2, np.maximum(LEAST_OWN * square, np.finfo(float).tiny))
+    precision = np.where(np.isnan(square), 0.0, 1 / own)  # none, where nothing tells the error
+    total = precision.sum(0)
+    weights = np.divide(precision, total, out=np.full_like(own, 1 / len(found)), where=total > 0)
+    shared = np.minimum(state**2, np.where(np.isnan(square), np.inf, square).min(0))
+    band = np.sqrt(shared + np.divide(1, total, out=np.full_like(total, np.nan), where=total > 0))
     all_places = [places_of(one.bodies, times) for one in found]
     places = []
-    for k in range(history.bodies.count):
-        faces, shares = history.bodies.body(k)[1].numpy(), weights[:, [0, *range(len(times) - 1)], k]
+    for k in range(bodies.count):
+        faces, shares = bodies.body(k)[1].numpy(), weights[:, [0, *range(len(times) - 1)], k]
         said = np.stack([one[k] for one in all_places])
         volumes = np.array([[TriangleMesh(x, faces).volume for x in one] for one in said])
         mean = np.einsum("wt,wtpx->tpx", shares, said)
         places.append(np.array([of_volume(x, faces, v) for x, v in zip(mean, (shares * volumes).sum(0))]))
     told = {name: value for one in found for name, value in one.told.items()}
-    return Forecast(on_paths(history.bodies, times, places), found[0].times, band, told)
+    return Forecast(on_paths(bodies, times, places), found[0].times, band, told)

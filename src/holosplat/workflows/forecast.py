@@ -129,7 +129,7 @@ def require_cells(run: Reconstruction, times: np.ndarray, options: ForecastOptio
     what was learnt cannot be asked; `MissingError` without its library."""
     if options.dynamics is not None:
         window_of(tracked_bodies(run), times, options.ahead(times), options.dynamics)
-    elif options.learned is not None and not options.decides:
+    if options.learned is not None and not options.decides:
         options.learned.fit(History(tracked_bodies(run), times, None)).ahead(options.ahead(times))
 
 

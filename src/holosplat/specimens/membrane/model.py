@@ -78,7 +78,7 @@ def area_forces(shape: Shape, rest: RestShape, local: float, whole: float) -> Te
     """Of the tension k (A - A₀)/A₀ in each triangle and k (S - S₀)/S₀ in all of them, moduli [N/m]."""
     areas = shape.areas
     tension = local * (areas / rest.area - 1)
-    tension = tension + whole * (areas.sum(-1, keepdim=True) / rest.surface - 1)
+    tension = tension + whole * (areas.sum(-1) / rest.surface - 1).unsqueeze(-1)
     unit = 0.5 * shape.normals / areas.unsqueeze(-1)
     pull = 0.5 * tension.unsqueeze(-1) * unit
     a, b, c = shape.corners.unbind(-2)
