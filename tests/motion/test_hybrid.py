@@ -65,21 +65,24 @@ def off(found: Forecast) -> np.ndarray:
     return np.array([(a - b)[..., 2].mean(1) for a, b in zip(places_of(found.bodies, AHEAD), truth(AHEAD))])
 
 
-def test_the_mean_is_that_of_least_variance():
-    """Of independent errors: inverse squares, one over whose sum is the variance; what nothing tells does not count."""
+def test_the_mean_is_by_inverse_squares():
+    """Its error is that of errors which are alike; what nothing tells does not count."""
     ways = (Off(3e-8, 1e-8, told={"peak_m_s": 0.05}), Off(-1e-8, 2e-8))
     found = HybridForecast(ways).fit(History(bodies(), TIMES)).ahead(AHEAD)
     assert off(found) == pytest.approx((4 * 3e-8 - 1e-8) / 5, rel=1e-6, abs=0)
-    assert found.band == pytest.approx(np.sqrt(1 / (1 + 1 / 4)) * 1e-8)
+    assert found.band == pytest.approx((4 * 1e-8 + 2e-8) / 5)
     assert found.told == {"peak_m_s": 0.05}
     assert found.times == pytest.approx(AHEAD)
     untold = HybridForecast((*ways[:1], Off(-1e-8, np.nan))).fit(History(bodies(), TIMES)).ahead(AHEAD)
     assert off(untold) == pytest.approx(3e-8, rel=1e-6, abs=0)
     assert untold.band == pytest.approx(1e-8)
+    nothing = HybridForecast((Off(3e-8, np.nan), Off(-1e-8, np.nan))).fit(History(bodies(), TIMES)).ahead(AHEAD)
+    assert off(nothing) == pytest.approx(1e-8, rel=1e-6, abs=0)
+    assert np.isnan(nothing.band).all()
 
 
 def test_the_error_of_the_state_does_not_average_out():
-    """Halves differ by it: both forecasts have it, and only what is beyond it counts and averages out."""
+    """Halves differ by it: both forecasts have it, and only what is beyond it counts."""
     halves = bodies(0.01), bodies(-0.01)
     history = History(bodies(), TIMES, halves)
     state = half_apart(bodies(), *(places_of(one, TIMES[-1:]) for one in halves))[0]
@@ -87,8 +90,10 @@ def test_the_error_of_the_state_does_not_average_out():
     ways = Off(0.0, 5e-7), Off(1e-7, 1e-6)
     found = HybridForecast(ways).fit(history).ahead(AHEAD)
     own = [way.band**2 - state**2 for way in ways]
-    assert found.band == pytest.approx(np.tile(np.sqrt(state**2 + 1 / (1 / own[0] + 1 / own[1])), (3, 1)))
-    assert off(found) == pytest.approx(np.tile(1e-7 * own[0] / (own[0] + own[1]), (3, 1)).T)
+    weight = own[0] / (own[0] + own[1])
+    wanted = np.sqrt(state**2 + ((1 - weight) * np.sqrt(own[0]) + weight * np.sqrt(own[1])) ** 2)
+    assert found.band == pytest.approx(np.tile(wanted, (3, 1)))
+    assert off(found) == pytest.approx(np.tile(1e-7 * weight, (3, 1)).T)
     surer = HybridForecast((Off(0.0, 1e-9), Off(1e-7, 1e-6))).fit(history).ahead(AHEAD)
     assert surer.band == pytest.approx(1e-9, rel=0.01)  # no error of the state that is larger than what is said
 

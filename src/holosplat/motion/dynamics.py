@@ -213,10 +213,11 @@ class HybridForecast:
 
 
 def pooled(found: Sequence[Forecast], history: History) -> Forecast:
-    """The mean of forecasts at the same times, that of least variance for each body by the errors that they state.
+    """The mean of forecasts at the same times, of each body by the inverse squares of the errors that they state.
 
-    The error of the state that all begin with is in each; beyond it errors are independent, and count by their inverse
-    squares. Bodies keep the mean of the volumes, too.
+    The error of the state that all begin with is in each, and only what is beyond it counts. How that is correlated is
+    not known: two models may be wrong alike, and the band is that of errors which are (Cauchy and Schwarz's bound).
+    Bodies keep the mean of the volumes, too.
     """
     times, bodies = np.r_[history.times[-1], found[0].times], history.bodies
     state = np.zeros(bodies.count)
@@ -228,7 +229,8 @@ def pooled(found: Sequence[Forecast], history: History) -> Forecast:
     total = precision.sum(0)
     weights = np.divide(precision, total, out=np.full_like(own, 1 / len(found)), where=total > 0)
     shared = np.minimum(state**2, np.where(np.isnan(square), np.inf, square).min(0))
-    band = np.sqrt(shared + np.divide(1, total, out=np.full_like(total, np.nan), where=total > 0))
+    band = np.sqrt(shared + np.where(precision > 0, weights * np.sqrt(own), 0.0).sum(0) ** 2)
+    band[total == 0] = np.nan
     all_places = [places_of(one.bodies, times) for one in found]
     places = []
     for k in range(bodies.count):
