@@ -32,6 +32,8 @@ from .membrane_fit import Bound, CellFlow, Unknowns, advanced
 
 AFFINE = 12
 """Numbers of a cell's first state: how far it is moved, and its linear map."""
+FINE = 4
+"""By how much steps are shortened, which nothing checks here."""
 CHANGE = 0.05
 """Of a whitened unknown, in differences of gradients: far above the rounding of frames."""
 MOST_UNKNOWNS = 64
@@ -160,7 +162,7 @@ class _Fit:
 
     def ways(self, unknowns: Unknowns, nodes: Tensor) -> list[Tensor]:
         """The nodes at each of the scan's times."""
-        times, found, steps = self.scan.instants, [nodes], self.model.steps(self.middle["peak"])
+        times, found, steps = self.scan.instants, [nodes], self.model.steps(self.middle["peak"], FINE)
         for wait in np.diff(times):
             velocity = lambda places: self.flow.velocity(places, unknowns)  # noqa: E731
             found.append(advanced(velocity, found[-1], float(wait), *steps))

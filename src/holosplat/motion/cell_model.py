@@ -38,6 +38,8 @@ CHANGES = (0.02, 0.3)
 """Relative changes of peak and shear modulus in finite differences."""
 FINER = (1, 4, 16)
 """By how much steps are shortened where the motion is not smooth; the fastest time by its square."""
+ROUGH = 0.01e-6
+"""Error of a step over a cell [m] from which on it is too long: cells that overlap push each other apart at once."""
 LEAP = 3.0
 """How far a node gets at most, in the way of the flow and a radius; beyond, the motion has become unstable."""
 AXES = "xyz"
@@ -181,13 +183,15 @@ class CellModel:
         outward = self.frame.outward
         return [np.array([outward(one.places(at[cell]).numpy()) for at in states]) for cell, one in enumerate(bound)]
 
-    def steps(self, peak: float) -> tuple[float, float]:
+    def steps(self, peak: float, finer: int) -> tuple[float, float]:
         """The longest step [s], and the fastest time [s] of what relaxes in it, as of `advanced`."""
-        return SHEARED * min(self.frame.across) / (4 * max(peak, torch.finfo(torch.float64).tiny)), self.fastest
+        step = SHEARED * min(self.frame.across) / (4 * max(peak, torch.finfo(torch.float64).tiny))
+        return step / finer, self.fastest / finer**2
 
     def _advance(self, velocity: Velocity, nodes: Tensor, wait: float, peak: float) -> Tensor:
-        """Nodes later, in finer steps where the usual ones are too long: where a node leaves the reach of its flow."""
-        reach, (step, fastest) = LEAP * (peak * wait + self.radius), self.steps(peak)
+        """Nodes later, in finer steps where the usual ones are too long: where a node leaves the reach of its flow, or
+        a cell is off by more than `ROUGH` in a step, by the method's own estimate."""
+        reach = LEAP * (peak * wait + self.radius)
 
         def within(places: Tensor) -> Tensor:
             away = float((places - nodes).abs().max())
@@ -196,15 +200,19 @@ class CellModel:
             return velocity(places)
 
         for finer in FINER:
+
+            def check(before: Tensor, after: Tensor, step: float, last: bool = finer == FINER[-1]) -> None:
+                off = 0.8 * (before - after) + 0.4 * step * (within(before) + within(after))
+                if not last and float(off.square().sum(-1).mean(-1).max()) > ROUGH**2:
+                    raise _Unstable
+
             try:
-                later = advanced(within, nodes, wait, step / finer, fastest / finer**2)
-                within(later)
+                return advanced(within, nodes, wait, *self.steps(peak, finer), check)
             except _Unstable:
                 continue
-            return later
         raise InputError(
             "the motion of the cells must be smooth, but it is not in steps of "
-            f"{step / FINER[-1]:.2g} s; lower the shear modulus or the peak, or raise the viscosity."
+            f"{self.steps(peak, FINER[-1])[0]:.2g} s; lower the shear modulus or the peak, or raise the viscosity."
         )
 
     def peak_of(self, places: Sequence[np.ndarray], speeds: Sequence[np.ndarray]) -> float:

@@ -201,8 +201,15 @@ class CellFlow:
         return carried + self._suspension.disturbance(nodes, self.forces(nodes, unknowns))
 
 
-def advanced(velocity: Velocity, nodes: Tensor, duration: float, step: float, fastest: float = torch.inf) -> Tensor:
-    """`nodes` [..., 3] [m] after `duration` [s], in even steps of at most `step` [s].
+def advanced(
+    velocity: Velocity,
+    nodes: Tensor,
+    duration: float,
+    step: float,
+    fastest: float = torch.inf,
+    check: Callable[[Tensor, Tensor, float], None] = lambda before, after, step: None,
+) -> Tensor:
+    """`nodes` [..., 3] [m] after `duration` [s], in even steps of at most `step` [s], each given to `check`.
 
     Runge, Kutta and Chebyshev's method of second order (Sommeijer, Shampine & Verwer 1998, J. Comput. Appl. Math. 88,
     315), whose s stages are stable up to 0.65 (s² - 1) of the time `fastest` [s] in which the flow relaxes.
@@ -211,9 +218,10 @@ def advanced(velocity: Velocity, nodes: Tensor, duration: float, step: float, fa
     count = max(1, round(duration / step + 0.499999))
     stages = max(2, ceil(sqrt(1 + duration / count / (0.65 * fastest))))
     for _ in range(count):
-        args = velocity, nodes, duration / count, stages
+        args, before = (velocity, nodes, duration / count, stages), nodes
         recomputed = torch.is_grad_enabled()
         nodes = checkpoint(_step, *args, use_reentrant=False) if recomputed else _step(*args)
+        check(before, nodes, duration / count)
     return nodes
 
 
