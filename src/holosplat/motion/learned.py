@@ -300,9 +300,9 @@ class GraphForecast:
 def learned(history: History, ahead: np.ndarray, options: GraphForecast = GraphForecast()) -> Forecast:
     """The bodies of `history` at the later times `ahead` [N] s, by the network.
 
-    Halves of the history say how uncertain the state is; without, it is taken for exact. The network is told how
-    uncertain the motion is; what places are off beyond that stays. Errors: `InputError` for fewer than DEGREE + 2
-    times, and for a horizon that was not trained on.
+    Halves of the history say how uncertain the state is; else it is exact. The network knows the error of the motion;
+    the rest of the error of places is added. Errors: `InputError` for fewer than DEGREE + 2 times, and for a horizon
+    that was not trained on.
     """
     bodies, known = history.bodies, history.times
     known = known[-max(options.window, DEGREE + 2) :] if options.window else known
