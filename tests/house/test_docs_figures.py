@@ -42,12 +42,12 @@ def test_new_rows_of_motion_appear_by_rule(figures, monkeypatch):
     rows["motion"] = [like | {"case": "flow4", "first": "7", "every": "3"}]
     assert [line.split(" | ")[0] for line in motion.windows().splitlines()[2:]] == ["| 20 … 35", "| 7, 10 … 52"]
     before = motion.forecast()
-    kept = [row for row in rows["forecast"] if row["model"] in ("paths", "auto")]
+    kept = [row for row in rows["forecast"] if row["model"] in ("paths", "dynamics")]
     rows["forecast"] = [row | {"case": "flow2-body"} for row in kept[1:]] + rows["forecast"]
     first, _, rest = motion.forecast().partition("\n\n")
     assert first == before
-    assert rest.startswith("*2 at 0°, 90°, `--body red-cell`*\n\n| times ahead | paths | auto | SSIM of paths, auto |")
-    assert re.fullmatch(r"\| 1 \| 0\.044 / 0\.0\d\d \| – \| 0\.998, – \|", rest.splitlines()[4])
+    assert rest.startswith("*2 at 0°, 90°, `--body red-cell`*\n\n| times ahead | paths | dynamics | SSIM of paths |")
+    assert re.fullmatch(r"\| 1 \| 0\.044 / 0\.0\d\d \| – \| 0\.998 \|", rest.splitlines()[4])
 
 
 def test_a_number_that_drifts_is_seen(figures):

@@ -35,15 +35,41 @@ def model() -> CellModel:
     return CellModel(FRAME, [cell()], 5e-6, 1.2e-3, 3)
 
 
-def test_steps_are_of_fourth_order():
-    """A flow that turns and grows: half the step leaves a sixteenth of the error."""
+def test_steps_are_of_second_order():
+    """A flow that turns and grows: half the step leaves a quarter of the error, with more stages, too."""
     start = torch.tensor([[1.0, 0.0, 0.5]], dtype=torch.float64)
     turn = torch.tensor([[0.1, -1.0, 0], [1.0, 0.1, 0], [0, 0, -0.3]], dtype=torch.float64)
     right = start @ torch.linalg.matrix_exp(2.5 * turn).T
-    with torch.no_grad():
-        errors = [float((advanced(lambda x: x @ turn.T, start, 2.5, h) - right).norm()) for h in (0.25, 0.125)]
-    assert errors[0] / errors[1] == pytest.approx(16, rel=0.15)
+    for fastest in (torch.inf, 0.01):
+        said = [advanced(lambda x: x @ turn.T, start, 2.5, h, fastest * h) for h in (0.25, 0.125)]
+        errors = [float((one - right).norm()) for one in said]
+        assert errors[0] / errors[1] == pytest.approx(4, rel=0.15)
     assert advanced(lambda x: 0 * x + 1, start, 0.7, 0.2) == pytest.approx(start + 0.7)
+
+
+def test_what_relaxes_fast_takes_few_stages_and_does_not_grow():
+    """A rate of a hundred steps: 13 stages, of which Runge's four would take a step of a fortieth each."""
+    calls, start = [], torch.ones(3, dtype=torch.float64)
+
+    def velocity(x: torch.Tensor) -> torch.Tensor:
+        calls.append(1)
+        return -torch.tensor([100.0, 30.0, 3.0]).double() * x
+
+    later = advanced(velocity, start, 1.0, 1.0, 0.01)
+    assert len(calls) == 13
+    assert later.abs().max() < 1
+    assert advanced(velocity, start, 5.0, 1.0, 0.01).abs().max() < 0.2
+
+
+def test_steps_are_shortened_where_more_relaxes_than_membranes():
+    """Four times as fast as the model thinks: at the end of the wait all is at rest, and not thrown about it."""
+    nodes, rate = torch.from_numpy(cell().vertices)[None], 4 / model().fastest
+    with torch.no_grad():
+        how = -rate, nodes + 1e-6
+        later = model()._advance(lambda x: how[0] * (x - how[1]), nodes, 5 * model().fastest, 0.05)
+        long = advanced(lambda x: how[0] * (x - how[1]), nodes, 5 * model().fastest, 1.0, model().fastest)
+    assert later.numpy() == pytest.approx(how[1].numpy(), abs=0.01e-6)
+    assert (long - how[1]).abs().max() > 1e-6
 
 
 def test_a_capsule_in_shear_flow_deforms_as_small_deformation_theory_says():
@@ -82,7 +108,7 @@ def test_gradients_go_back_through_all_steps():
     def value(scales: torch.Tensor) -> torch.Tensor:
         unknowns = Unknowns(0.05 * scales[0], 5e-6 * scales[1])
         start = nodes + scales[2] * shift * (nodes - nodes.mean()) / 1e-6
-        later = advanced(lambda x: flow.velocity(x, unknowns), start, 3 * model().step, model().step)
+        later = advanced(lambda x: flow.velocity(x, unknowns), start, 1.2e-5, 4e-6, model().fastest)
         return 1e6 * (later * target).sum()
 
     at = torch.tensor([1.1, 0.8, 0.3], dtype=torch.float64, requires_grad=True)

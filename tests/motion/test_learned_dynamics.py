@@ -19,7 +19,7 @@ from holosplat.io.vtk import read_meshes
 from holosplat.learning.start import Card
 from holosplat.matter import Matter
 from holosplat.metrics.volumes import normal_distance
-from holosplat.motion.forecast import History, PathForecast, decided, extrapolate
+from holosplat.motion.forecast import History, PathForecast, decided, extrapolate, places_of
 from holosplat.motion.learned import (
     DEGREE,
     NEAR,
@@ -28,6 +28,7 @@ from holosplat.motion.learned import (
     DynamicsSize,
     GraphForecast,
     Scene,
+    State,
     ahead_of,
     base,
     learned,
@@ -158,7 +159,7 @@ def untrained(tmp_path) -> str:
 
 
 def test_without_training_bodies_go_straight_on(untrained):
-    found = learned(straight(), TIMES, AHEAD, GraphForecast(untrained))
+    found = learned(History(straight(), TIMES), AHEAD, GraphForecast(untrained))
     for body, size in enumerate((3e-6, 2e-6)):
         for time in AHEAD:
             vertices = found.bodies.bodies(time)[body].vertices
@@ -168,22 +169,50 @@ def test_without_training_bodies_go_straight_on(untrained):
     assert found.band[:, 1] / found.band[:, 0] == pytest.approx(2 / 3, rel=1e-3)
 
 
+def halves(velocity: float, place: float) -> tuple[MovingSurfaces, MovingSurfaces]:
+    """Of `straight`, off by so much [m/s, m] each way, along normals."""
+    bodies, found = straight(), []
+    normals = torch.tensor(np.tile(SPHERE, (2, 1)))[None]
+    waits = torch.tensor(bodies.basis.fitted(TIMES, TIMES[:, None] - TIMES[-1]))[..., None]
+    for sign in (1, -1):
+        off = sign * (place + velocity * waits) * normals / bodies.unit_length
+        found.append(bodies.with_parameters({"coefficients": bodies.coefficients + off.to(bodies.coefficients)}))
+    return found[0], found[1]
+
+
+def test_the_network_is_told_the_error_of_the_motion(untrained):
+    """Errors of places that stay are no errors of the motion, and remain; those of velocities are told in the size
+    that errors have which are alike in all coefficients, as trained on: σ² Σ (k (k + 1))²/(D + 1) at the end."""
+    length = float(TIMES[-1] - TIMES[0])
+    rates = np.sqrt(np.mean([(k * (k + 1)) ** 2 for k in range(DEGREE + 1)]))
+    faces = FACES.astype(np.int64)
+    for speed, place in ((0.0, 5e-8), (1e-3, 0.0), (1e-3, 5e-8)):
+        both = halves(speed, place)
+        states = [State.of(places_of(one, TIMES)[0], faces, TIMES) for one in both]
+        exact = State.of(places_of(straight(), TIMES)[0], faces, TIMES)
+        assert exact.apart(*states) * exact.radius == pytest.approx(speed * length / rates, rel=0.02, abs=1e-12)
+        band = learned(History(straight(), TIMES, both), AHEAD, GraphForecast(untrained)).band[0, 0]
+        without = learned(History(straight(), TIMES), AHEAD, GraphForecast(untrained)).band[0, 0]
+        stays = max(place**2 - (speed * length / rates) ** 2, 0)
+        assert band == pytest.approx(np.hypot(without, np.sqrt(stays)), rel=0.02)
+
+
 def test_what_cannot_be_foretold_is_refused(untrained, tmp_path):
     how = GraphForecast(untrained)
     with pytest.raises(InputError, match=r"at least, but the run has 4; take --by paths"):
-        learned(straight(TIMES[:4]), TIMES[:4], AHEAD, how)
+        learned(History(straight(TIMES[:4]), TIMES[:4]), AHEAD, how)
     with pytest.raises(InputError, match=r"up to 1.2 windows.*fewer --times"):
-        learned(straight(), TIMES, TIMES[-1] + np.array([2e-4]), how)
+        learned(History(straight(), TIMES), TIMES[-1] + np.array([2e-4]), how)
     (tmp_path / "other.safetensors").write_bytes(b"no weights")
     with pytest.raises(InputError, match="must be a safetensors file"):
-        learned(straight(), TIMES, AHEAD, GraphForecast(str(tmp_path / "other.safetensors")))
+        learned(History(straight(), TIMES), AHEAD, GraphForecast(str(tmp_path / "other.safetensors")))
 
 
 def test_paths_and_the_network_are_decided_by_times_that_neither_saw(untrained):
     """Where both are alike, and where the network cannot be asked, paths go on."""
     history = History(straight(), TIMES)
-    assert decided(history, PathForecast(), GraphForecast(untrained)).choice == "paths"
-    short = decided(History(straight(TIMES[:6]), TIMES[:6]), PathForecast(), GraphForecast(untrained))
+    assert decided(history, PathForecast(), [GraphForecast(untrained)]).choice == "paths"
+    short = decided(History(straight(TIMES[:6]), TIMES[:6]), PathForecast(), [GraphForecast(untrained)])
     assert short.choice == "paths"
     assert "graph was not asked" in short.by
 
@@ -226,7 +255,7 @@ def test_a_training_goes_on_where_it_was_cut_off(series, tmp_path):
     again, _ = train_dynamics(series, tmp_path / "cut", OPTIONS, True, lambda _: None, {})
     for name, tensor in load_file(whole).items():
         assert torch.equal(load_file(again)[name], tensor), name
-    found = learned(straight(), TIMES, AHEAD, GraphForecast(str(whole)))
+    found = learned(History(straight(), TIMES), AHEAD, GraphForecast(str(whole)))
     assert np.isfinite(found.band).all()
 
 
@@ -298,7 +327,7 @@ def test_cells_of_another_simulator(espresso_rbc):
     fitted = [basis.fitted(times[:24], np.array([mesh.vertices for mesh in path[:24]])) for path in paths]
     bodies = MovingSurfaces.of_bodies(fitted, [path[0].faces for path in paths], basis, 1e-6, Matter.one(1e-7, 0.0))
     ahead = times[[last + 15, last + 25]]
-    found, others = learned(bodies, times[:24], ahead), extrapolate(bodies, times[:24], ahead)
+    found, others = learned(History(bodies, times[:24]), ahead), extrapolate(bodies, times[:24], ahead)
     for n, time in enumerate(ahead):
         for k, path in enumerate(paths):
             missed = normal_distance(found.bodies.bodies(time)[k], path[24 + n])

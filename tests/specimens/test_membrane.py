@@ -139,6 +139,25 @@ def test_bending_of_a_sphere():
     assert float(rest.angle.min()) > 0  # convex is positive
 
 
+def test_bending_of_a_triangle_that_has_lost_its_area_stays_finite(monkeypatch):
+    """A corner on its way to the opposite edge: the angle's gradient grows as one over the height without end."""
+    membrane = Membrane(sphere(2), only("bending"))
+    nodes, (a, b, c) = torch.from_numpy(membrane.mesh.vertices.copy()), membrane.mesh.faces[0]
+    middle = 0.5 * (nodes[a] + nodes[b])
+
+    def force(height: float) -> float:
+        moved = nodes.clone()
+        moved[c] = middle + height * (nodes[c] - middle)
+        return float(membrane.forces(moved)[c].norm())
+
+    bounded = [force(height) for height in (0.2, 1e-3, 1e-6)]
+    assert bounded[2] == pytest.approx(bounded[1], rel=0.05)
+    assert bounded[2] < 2 * bounded[0]
+    monkeypatch.setattr(model, "THIN", 0.0)
+    assert force(0.2) == bounded[0]
+    assert force(1e-6) > 1e3 * bounded[2]
+
+
 def test_float32_and_single_cells():
     membrane = Membrane(resting_cell(4))
     nodes = crumpled(membrane)

@@ -54,12 +54,12 @@ class ForecastFlags:
     """Times ahead."""
     step: Seconds | None = None
     """Between them [s] (default: the median step of the run)."""
-    by: Literal["auto", "paths", "rigid", "mechanics", "assimilate", "graph", "dmd", "sindy"] = "auto"
+    by: Literal["auto", "paths", "rigid", "mechanics", "assimilate", "graph", "hybrid", "dmd", "sindy"] = "auto"
     """Paths go on, each part of the motion as far as frames tell it; rigid: shapes stay; mechanics: red cells in the
     flow of --channel, which their paths over the last times tell; assimilate: the same, fitted to the frames of these
-    times (4D-Var); graph: a network that learnt from red cells in flow; dmd, sindy: modes of each body's own past;
-    auto: with a channel the mean of paths and mechanics by their errors, without one paths, or the network where it
-    tells the last third of the times better."""
+    times (4D-Var); graph: a network that learnt from red cells in flow; hybrid: the mean of mechanics and the network
+    by their errors; dmd, sindy: modes of each body's own past; auto: paths, unless the network, or with a channel the
+    hybrid, tells the last third of the times better."""
     weights: str = ""
     """File of the network's weights, as train --network dynamics writes it (default: those of the package)."""
     degree: int = 2
@@ -96,26 +96,26 @@ class ForecastFlags:
         steps = max(1, round(positive("--effort", self.effort) * fit.schedule.steps))
         fit = replace(fit, schedule=replace(fit.schedule, steps=steps))
         learned, decides = self._learned(), self.by == "auto"
-        return ForecastOptions(self.times, step, model, self._dynamics(), learned, decides, self.half_sets, fit)
+        return ForecastOptions(self.times, step, model, self._dynamics(model), learned, decides, self.half_sets, fit)
 
     def _learned(self) -> GraphForecast | DmdForecast | SindyForecast | None:
         if self.by == "dmd" or self.by == "sindy":
             return (DmdForecast if self.by == "dmd" else SindyForecast)(self.window)
-        if self.by == "graph" or (self.by == "auto" and self.channel is None):
+        if self.by in ("graph", "hybrid", "auto"):
             return GraphForecast(self.weights, self.window, self.keep_volume)
         return None
 
-    def _dynamics(self) -> DynamicsForecast | None:
+    def _dynamics(self, paths: PathForecast) -> DynamicsForecast | None:
         require(
-            self.by not in ("mechanics", "assimilate") or self.channel is not None,
+            self.by not in ("mechanics", "hybrid", "assimilate") or self.channel is not None,
             f"--by {self.by} needs the channel that cells flow through; say --channel WIDTH HEIGHT [m].",
         )
-        if self.channel is None or self.by not in ("auto", "mechanics", "assimilate"):
+        if self.channel is None or self.by not in ("auto", "mechanics", "hybrid", "assimilate"):
             return None
         frame = ChannelFrame(self.channel, self.flow_axis, self.channel_centre)
         peak = (0.0, 0.0) if self.peak is None else _number_or_range("peak", self.peak)
         shear = _number_or_range("shear_modulus", self.shear_modulus)
-        how = {"back": self.back, "mixed": self.by == "auto", "frames": self.by == "assimilate"}
+        how = {"back": self.back, "frames": self.by == "assimilate", "paths": paths}
         return DynamicsForecast(frame, peak, shear, self.viscosity, **how)
 
 

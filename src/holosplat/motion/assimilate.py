@@ -9,7 +9,7 @@ through the waves, the surface projector and all time steps (Le Dimet & Talagran
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -32,6 +32,8 @@ from .membrane_fit import Bound, CellFlow, Unknowns, advanced
 
 AFFINE = 12
 """Numbers of a cell's first state: how far it is moved, and its linear map."""
+FINE = 4
+"""By how much steps are shortened, which nothing checks here."""
 CHANGE = 0.05
 """Of a whitened unknown, in differences of gradients: far above the rounding of frames."""
 MOST_UNKNOWNS = 64
@@ -160,10 +162,10 @@ class _Fit:
 
     def ways(self, unknowns: Unknowns, nodes: Tensor) -> list[Tensor]:
         """The nodes at each of the scan's times."""
-        times, found = self.scan.instants, [nodes]
+        times, found, steps = self.scan.instants, [nodes], self.model.steps(self.middle["peak"], FINE)
         for wait in np.diff(times):
             velocity = lambda places: self.flow.velocity(places, unknowns)  # noqa: E731
-            found.append(advanced(velocity, found[-1], float(wait), self.model.step))
+            found.append(advanced(velocity, found[-1], float(wait), *steps))
         return found
 
     def misses(self, unknowns: Unknowns, nodes: Tensor) -> list[Tensor]:
@@ -200,8 +202,8 @@ STEPS = 20
 """Of L-BFGS, at most."""
 
 
-def carry_by_frames(window: Window, train: Scan, oversample: int) -> tuple[Forecast, dict[str, float]]:
-    """The cells of `window`, fitted to its frames and carried on; and what was found of the flow.
+def carry_by_frames(window: Window, train: Scan, oversample: int) -> Forecast:
+    """The cells of `window`, fitted to its frames and carried on; told: what was found of the flow.
 
     train: frames of the run, relative to the light, of which those of the window's times are taken, without what all
     other bodies predict of them; oversample: wave samples a pixel. The band has the part of the state, as fits to
@@ -219,7 +221,7 @@ def carry_by_frames(window: Window, train: Scan, oversample: int) -> tuple[Forec
     later = [own[1:] for own in later]
     pairs = zip(later, window.meshes(-1))
     left = np.array([normal_distance(TriangleMesh(own[0], seen.faces), seen) for own, seen in pairs])
-    return window.gone_on(later, left), _as_plain_numbers(found, options, len(start))
+    return replace(window.gone_on(later, left), told=_as_plain_numbers(found, options, len(start)))
 
 
 def _as_plain_numbers(found: Assimilated, options: Assimilation, cells: int) -> dict[str, float]:

@@ -22,8 +22,10 @@ ENDLESS = 1e-3
 """Length of the channel [m]: no field holds cells that feel each other around it."""
 FREQUENCY = 4
 """Of the membranes' meshes: 162 nodes."""
-STABLE = 1.0
-"""Longest step in units of viscosity × radius over the modulus of area, the fastest time of a membrane."""
+STABLE = 0.9
+"""Fastest time of a membrane in units of viscosity × radius over the modulus of area."""
+SHEARED = 0.25
+"""Longest step times the greatest shear rate of the channel: after 20 steps, places are off by a nanometre."""
 REACH = 3.0
 """Cells whose centres are farther apart than so many radii do not feel each other's flow."""
 PRIOR = 0.01
@@ -35,7 +37,9 @@ INDEPENDENT = 20.0
 CHANGES = (0.02, 0.3)
 """Relative changes of peak and shear modulus in finite differences."""
 FINER = (1, 4, 16)
-"""By how much steps are shortened where the motion is not smooth."""
+"""By how much steps are shortened where the motion is not smooth; the fastest time by its square."""
+ROUGH = 0.01e-6
+"""Error of a step over a cell [m] from which on it is too long: cells that overlap push each other apart at once."""
 LEAP = 3.0
 """How far a node gets at most, in the way of the flow and a radius; beyond, the motion has become unstable."""
 AXES = "xyz"
@@ -132,7 +136,7 @@ class CellModel:
         self.frame = frame
         self.membrane = Membrane(scaled(resting_cell(frequency), meshes), Elasticity(skalak_shear=shear))
         self.radius = float((self.membrane.rest.surface / (4 * np.pi)).sqrt())
-        self.step = STABLE * viscosity * self.radius / self.membrane.elasticity.global_area
+        self.fastest = STABLE * viscosity * self.radius / self.membrane.elasticity.global_area
         self._medium = Medium(viscosity, reach=min(REACH * self.radius, 0.5 * ENDLESS))
 
     def dressed(self, meshes: Sequence[TriangleMesh]) -> tuple[CellFlow, Tensor, list[Bound]]:
@@ -175,13 +179,19 @@ class CellModel:
         states = [nodes]
         with torch.no_grad():
             for wait in np.diff(times):
-                reach = LEAP * (float(unknowns.peak) * float(wait) + self.radius)
-                states.append(self._advance(velocity, states[-1], float(wait), reach))
+                states.append(self._advance(velocity, states[-1], float(wait), float(unknowns.peak)))
         outward = self.frame.outward
         return [np.array([outward(one.places(at[cell]).numpy()) for at in states]) for cell, one in enumerate(bound)]
 
-    def _advance(self, velocity: Velocity, nodes: Tensor, wait: float, reach: float) -> Tensor:
-        """Nodes later, in finer steps where the usual ones are too long: where a node moves beyond `reach` [m]."""
+    def steps(self, peak: float, finer: int) -> tuple[float, float]:
+        """The longest step [s], and the fastest time [s] of what relaxes in it, as of `advanced`."""
+        step = SHEARED * min(self.frame.across) / (4 * max(peak, torch.finfo(torch.float64).tiny))
+        return step / finer, self.fastest / finer**2
+
+    def _advance(self, velocity: Velocity, nodes: Tensor, wait: float, peak: float) -> Tensor:
+        """Nodes later, in finer steps where the usual ones are too long: where a node leaves the reach of its flow, or
+        a cell is off by more than `ROUGH` in a step, by the method's own estimate."""
+        reach = LEAP * (peak * wait + self.radius)
 
         def within(places: Tensor) -> Tensor:
             away = float((places - nodes).abs().max())
@@ -190,15 +200,19 @@ class CellModel:
             return velocity(places)
 
         for finer in FINER:
+
+            def check(before: Tensor, after: Tensor, step: float, last: bool = finer == FINER[-1]) -> None:
+                off = 0.8 * (before - after) + 0.4 * step * (within(before) + within(after))
+                if not last and float(off.square().sum(-1).mean(-1).max()) > ROUGH**2:
+                    raise _Unstable
+
             try:
-                later = advanced(within, nodes, wait, self.step / finer)
-                within(later)
+                return advanced(within, nodes, wait, *self.steps(peak, finer), check)
             except _Unstable:
                 continue
-            return later
         raise InputError(
             "the motion of the cells must be smooth, but it is not in steps of "
-            f"{self.step / FINER[-1]:.2g} s; lower the shear modulus or the peak, or raise the viscosity."
+            f"{self.steps(peak, FINER[-1])[0]:.2g} s; lower the shear modulus or the peak, or raise the viscosity."
         )
 
     def peak_of(self, places: Sequence[np.ndarray], speeds: Sequence[np.ndarray]) -> float:

@@ -3,11 +3,13 @@
 The model is not the truth: walls do not answer, moduli are those of healthy cells, and where a membrane's nodes are on
 a surface is not seen. So it is run over the last times of the window first, against the paths that were fitted there:
 what it misses is put down to the peak of the flow and the shear modulus, as far as a range is left to them, and to a
-small linear flow about each cell, which then goes on.
+small linear flow about each cell, which then goes on. What it misses yet, a network that learnt from other cells may
+know: the hybrid is the mean of both by the errors that they state.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -20,14 +22,27 @@ from ..representations import MovingSurfaces
 from ..specimens.flow.suspension import PLASMA_VISCOSITY
 from ..specimens.red_cells import RedCell
 from .cell_model import CellModel, ChannelFrame, Range
-from .forecast import Forecast, Halves, History, Model, PathForecast, extrapolate, on_paths, places_of, smoothed
+from .forecast import (
+    Forecast,
+    Forecaster,
+    Halves,
+    History,
+    Model,
+    PathForecast,
+    extrapolate,
+    half_apart,
+    of_volume,
+    on_paths,
+    places_of,
+    smoothed,
+)
 
 ALIKE = 0.3
 """A body whose volume differs from the median by more is no whole cell."""
 STRETCHED = 1.15
 """Area of a cell over that of a resting one of its volume, at most: membranes tear at less, and tracks are rough."""
-GOING_ON = PathForecast()
-"""The usual options of forecasts."""
+LEAST_OWN = 1e-4
+"""Of a forecast's squared error, which is its own at least."""
 PEAK = 0.04
 """How far the peak may be from that which the bodies' velocities say, as a share."""
 
@@ -50,19 +65,14 @@ class DynamicsForecast:
     """Last times over which the model is compared with the paths, at most a third of the run's."""
     free: bool = True
     """Whether what is wrong with the flow about each cell is put down to a linear flow of its own."""
-    mixed: bool = False
-    """Whether paths that go on count, too, by the inverse squares of both bands."""
     frames: bool = False
     """Whether the model is fitted to the window's frames, and not to the paths that were fitted to them (4D-Var)."""
+    paths: PathForecast = PathForecast()
+    """How bodies go on that are no whole cells in the channel."""
 
     def fit(self, history: History) -> Model:
-        """Mechanics on the history, whose paths go on as usual."""
-
-        def ahead(times: np.ndarray) -> Forecast:
-            found, told = carry(history.bodies, history.times, times, self, GOING_ON, history.halves)
-            return replace(found, told=told)
-
-        return Model(ahead)
+        """Mechanics on the history."""
+        return Model(lambda ahead: carry(history.bodies, history.times, ahead, self, history.halves))
 
     def __post_init__(self) -> None:
         in_range("viscosity", self.viscosity, 1e-6, 1e3, unit="pascal seconds")
@@ -102,10 +112,7 @@ class Window:
         growth = (self.every - self.every[0]) / (self.past[-1] - self.past[0])
         for k, own, missed in zip(self.cells, later, left):
             error = np.hypot(self.spread[-1, k], growth * missed)
-            weight = _weights(error[1:], self.base.band[:, k], self.options.mixed)
-            places[k] = own + np.r_[0.0, 1 - weight][:, None, None] * (places[k] - own)
-            mixed = np.sqrt((weight * error[1:]) ** 2 + ((1 - weight) * self.base.band[:, k]) ** 2)
-            band[:, k] = mixed if self.options.mixed else error[1:]
+            places[k], band[:, k] = own, error[1:]
         return Forecast(on_paths(self.bodies, self.every, places), self.every[1:], band)
 
 
@@ -114,23 +121,22 @@ def carry(
     times: np.ndarray,
     ahead: np.ndarray,
     options: DynamicsForecast,
-    paths: PathForecast = GOING_ON,
     halves: Halves | None = None,
-) -> tuple[Forecast, dict[str, float]]:
-    """`bodies`, fitted at `times` [T] s, at the later times `ahead` [N] s, and what was found of the flow.
+) -> Forecast:
+    """`bodies`, fitted at `times` [T] s, at the later times `ahead` [N] s; told: what was found of the flow.
 
     Whole cells within the channel go by mechanics, from the state that their paths have at the last time; all others
     as `extrapolate` says. The band has the state's part, and what the model left of the window, growing with time.
     Errors: `InputError` where no body is a whole cell within the channel.
     """
-    window = window_of(bodies, times, ahead, options, paths, halves)
+    window = window_of(bodies, times, ahead, options, halves)
     ranges = {"peak": window.peak, "shear": options.shear}
     tracked = [window.seen[k] for k in window.cells]
     fitted = window.model.fitted(window.meshes(0), tracked, window.past, ranges, options.free)
     later = window.model.run(window.meshes(-1), window.every, fitted.unknowns, fitted.wrong)
     for own, seen in zip(later, tracked):
         own += seen[-1] - own[0]  # what the coarse membrane does not follow
-    return window.gone_on(later, fitted.left), fitted.as_dict()
+    return replace(window.gone_on(later, fitted.left), told=fitted.as_dict())
 
 
 def window_of(
@@ -138,14 +144,13 @@ def window_of(
     times: np.ndarray,
     ahead: np.ndarray,
     options: DynamicsForecast,
-    paths: PathForecast = GOING_ON,
     halves: Halves | None = None,
 ) -> Window:
     """Initial state of the mechanics, as of `carry`."""
-    known = paths.times(times)
+    known = options.paths.times(times)
     past = known[-1 - min(options.back, max(1, len(known) // 3)) :]
-    seen, spread = smoothed(bodies, known, past, paths, halves)
-    base = extrapolate(bodies, times, ahead, paths, halves)
+    seen, spread = smoothed(bodies, known, past, options.paths, halves)
+    base = extrapolate(bodies, times, ahead, options.paths, halves)
     faces = [bodies.body(k)[1].numpy() for k in range(bodies.count)]
     cells = whole_cells([TriangleMesh(one[-1], f) for one, f in zip(seen, faces)], options.frame)
     require(
@@ -192,9 +197,47 @@ def _peak(
     return (1 - PEAK) * found, (1 + PEAK) * found
 
 
-def _weights(error: np.ndarray, other: np.ndarray, mixed: bool) -> np.ndarray:
-    """[N] what mechanics count beside paths: the inverse squares of both errors."""
-    if not mixed:
-        return np.ones_like(error)
-    known = np.where(np.isnan(other), np.inf, other)
-    return np.where(np.isinf(known), 1.0, known**2 / np.maximum(error**2 + known**2, np.finfo(float).tiny))
+@dataclass(frozen=True)
+class HybridForecast:
+    """The mean of several ways on."""
+
+    kind: ClassVar[str] = "hybrid"
+
+    ways: tuple[Forecaster, ...]
+    """Two at least, such as mechanics and the network that learnt from other cells."""
+
+    def fit(self, history: History) -> Model:
+        """Each of them on the history."""
+        models = [way.fit(history) for way in self.ways]
+        return Model(lambda ahead: pooled([one.ahead(ahead) for one in models], history))
+
+
+def pooled(found: Sequence[Forecast], history: History) -> Forecast:
+    """The mean of forecasts at the same times, of each body by the inverse squares of the errors that they state.
+
+    The error of the state that all begin with is in each, and only what is beyond it counts. How that is correlated is
+    not known: two models may be wrong alike, and the band is that of errors which are (Cauchy and Schwarz's bound).
+    Bodies keep the mean of the volumes, too.
+    """
+    times, bodies = np.r_[history.times[-1], found[0].times], history.bodies
+    state = np.zeros(bodies.count)
+    if history.halves is not None:
+        (state,) = half_apart(bodies, *(places_of(half, times[:1]) for half in history.halves))
+    square = np.stack([one.band for one in found]) ** 2
+    own = np.maximum(square - state**2, np.maximum(LEAST_OWN * square, np.finfo(float).tiny))
+    precision = np.where(np.isnan(square), 0.0, 1 / own)  # none, where nothing tells the error
+    total = precision.sum(0)
+    weights = np.divide(precision, total, out=np.full_like(own, 1 / len(found)), where=total > 0)
+    shared = np.minimum(state**2, np.where(np.isnan(square), np.inf, square).min(0))
+    band = np.sqrt(shared + np.where(precision > 0, weights * np.sqrt(own), 0.0).sum(0) ** 2)
+    band[total == 0] = np.nan
+    all_places = [places_of(one.bodies, times) for one in found]
+    places = []
+    for k in range(bodies.count):
+        faces, shares = bodies.body(k)[1].numpy(), weights[:, [0, *range(len(times) - 1)], k]
+        said = np.stack([one[k] for one in all_places])
+        volumes = np.array([[TriangleMesh(x, faces).volume for x in one] for one in said])
+        mean = np.einsum("wt,wtpx->tpx", shares, said)
+        places.append(np.array([of_volume(x, faces, v) for x, v in zip(mean, (shares * volumes).sum(0))]))
+    told = {name: value for one in found for name, value in one.told.items()}
+    return Forecast(on_paths(bodies, times, places), found[0].times, band, told)

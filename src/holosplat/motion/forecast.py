@@ -258,26 +258,25 @@ def extrapolate(
     return told_by(say, bodies, options.times(times), ahead, halves, options.degree)
 
 
-def decided(history: History, paths: PathForecast, other: Forecaster) -> Decision:
-    """Whether bodies go on as `paths` or as the `other` way says: which tells the last third of the times better from
-    those before. Bodies are the blocks of the score; where the other way cannot be asked, paths it is."""
+def decided(history: History, paths: PathForecast, others: Sequence[Forecaster]) -> Decision:
+    """Whether bodies go on as `paths` or as another way says, from simple to complex: which tells the last third of the
+    times better from those before. Bodies are the blocks of the score; ways that cannot be asked are left out."""
     early, late = np.split(history.times, [(2 * len(history.times) + 2) // 3])
     before = History(history.bodies, early, history.halves)
     truth = places_of(history.bodies, late)
-
-    def score(name: str, fold: int) -> Score:
-        said = (paths if name == paths.kind else other).fit(before).ahead(late)
+    scores, by = dict[str, Score](), "the last third of the run's times"
+    for way in (paths, *others):
+        try:
+            said = way.fit(before).ahead(late)
+        except InputError as error:
+            by += f"; {way.kind} was not asked: {error}"
+            continue
         missed = [
             [(across(one, true, history.bodies.body(k)[1].numpy()) ** 2).mean()]
             for k, (one, true) in enumerate(zip(places_of(said.bodies, late), truth))
         ]
-        return Score(np.array(missed))
-
-    by = "the last third of the run's times"
-    try:
-        return select("how bodies go on", (paths.kind, other.kind), score, by=by)
-    except InputError as error:
-        return Decision("how bodies go on", paths.kind, f"{by}; {other.kind} was not asked: {error}")
+        scores[way.kind] = Score(np.array(missed))
+    return select("how bodies go on", list(scores), lambda name, fold: scores[name], by=by)
 
 
 Say = Callable[[MovingSurfaces, np.ndarray, np.ndarray, "Halves | None"], "tuple[Places, np.ndarray]"]

@@ -12,7 +12,7 @@ is given by Legendre polynomials of degree `DEGREE`, which paths of flowing cell
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
@@ -29,10 +29,9 @@ from ..io.atomic import atomic_path
 from ..learning.start import Card, card_of, size_of, tensors_of
 from ..mesh import TriangleMesh
 from ..ranges import ManyOrNone, Natural, ranged
-from ..representations import MovingSurfaces
 from ..specimens.flow.suspension import PLASMA_VISCOSITY
 from ..specimens.membrane.model import Elasticity
-from .forecast import Forecast, Halves, History, Model, half_apart, of_volume, on_paths, places_of
+from .forecast import Forecast, History, Model, half_apart, of_volume, on_paths, places_of
 
 SHIPPED, VERSION = Path(__file__).with_name("flowing_cells.safetensors"), "dynamics 1"
 DEGREE = 4
@@ -295,22 +294,18 @@ class GraphForecast:
 
     def fit(self, history: History) -> Model:
         """The network on the history."""
-        return Model(lambda ahead: learned(history.bodies, history.times, ahead, self, history.halves))
+        return Model(lambda ahead: learned(history, ahead, self))
 
 
-def learned(
-    bodies: MovingSurfaces,
-    times: np.ndarray,
-    ahead: np.ndarray,
-    options: GraphForecast = GraphForecast(),
-    halves: Halves | None = None,
-) -> Forecast:
-    """`bodies`, fitted to frames at `times` [T] s, at the later times `ahead` [N] s, by the network.
+def learned(history: History, ahead: np.ndarray, options: GraphForecast = GraphForecast()) -> Forecast:
+    """The bodies of `history` at the later times `ahead` [N] s, by the network.
 
-    halves: fits to two halves of the frames, whose difference says how uncertain the state is; without, it is taken
-    for exact. Errors: `InputError` for fewer than DEGREE + 2 times, and for a horizon that was not trained on.
+    Halves of the history say how uncertain the state is; else it is exact. The network knows the error of the motion;
+    the rest of the error of places is added. Errors: `InputError` for fewer than DEGREE + 2 times, and for a horizon
+    that was not trained on.
     """
-    known = times[-max(options.window, DEGREE + 2) :] if options.window else times
+    bodies, known = history.bodies, history.times
+    known = known[-max(options.window, DEGREE + 2) :] if options.window else known
     require(
         len(known) > DEGREE + 1,
         f"the network must see {DEGREE + 2} times at least, but the run has {len(known)}; take --by paths.",
@@ -325,10 +320,13 @@ def learned(
     places = places_of(bodies, known)
     horizon = torch.from_numpy(np.r_[0.0, (ahead - known[-1]) / length])
     faces = [bodies.body(k)[1].numpy() for k in range(bodies.count)]
-    noise = np.zeros(bodies.count)
-    if halves is not None:
-        (noise,) = half_apart(bodies, *(places_of(half, known[-1:]) for half in halves))
-    states = [State.of(one, faces[k], known, noise[k]) for k, one in enumerate(places)]
+    states = [State.of(one, faces[k], known) for k, one in enumerate(places)]
+    place = torch.zeros(bodies.count).double()
+    if (halves := history.halves) is not None:
+        both = [[State.of(one, faces[k], known) for k, one in enumerate(places_of(half, known))] for half in halves]
+        states = [replace(one, noise=one.apart(*pair)) for one, *pair in zip(states, *both)]
+        (apart,) = half_apart(bodies, *(places_of(half, known[-1:]) for half in halves))
+        place = torch.tensor([max((a / one.radius) ** 2 - one.noise**2, 0.0) for a, one in zip(apart, states)])
     scene, radii = _scene(states, length)
     with torch.no_grad():
         found, spread = trained.network(scene)
@@ -340,24 +338,24 @@ def learned(
             usual = float(np.mean([TriangleMesh(one, faces[k]).volume for one in places[k]]))
             later = np.array([of_volume(one, faces[k], usual) for one in later])
         said.append(later)
-    band = (radii[:, None] * errors.square().mean(1).sqrt()).T.numpy()
+    band = (radii[:, None] * (errors.square().mean(1) + place[:, None]).sqrt()).T.numpy()
     return Forecast(on_paths(bodies, np.r_[known[-1], ahead], said), ahead, band)
 
 
 @dataclass(frozen=True)
 class State:
-    """A body's window. own: [P, D + 1, 3] radii; middle: [D + 1, 3] radii; normals: [P, 3]; radius: [m]; noise:
-    [radii]; nodes: numbers [n] of those that the network sees."""
+    """A body's window. own: [P, D + 1, 3] radii; middle: [D + 1, 3] radii; normals: [P, 3]; radius: [m]; nodes: numbers
+    [n] of those that the network sees; noise: [radii], as of `apart`."""
 
     own: Tensor
     middle: Tensor
     normals: Tensor
     radius: float
-    noise: float
     nodes: np.ndarray
+    noise: float = 0.0
 
     @classmethod
-    def of(cls, places: np.ndarray, faces: np.ndarray, times: np.ndarray, noise: float) -> State:
+    def of(cls, places: np.ndarray, faces: np.ndarray, times: np.ndarray) -> State:
         """From places [T, P, 3] [m] at `times` [T] s."""
         scaled = 2 * (times - times[0]) / (times[-1] - times[0]) - 1
         radius = (3 * abs(TriangleMesh(places[-1], faces).volume) / (4 * np.pi)) ** (1 / 3)
@@ -366,7 +364,15 @@ class State:
         middle = whole.mean(0)
         own = whole - middle
         normals = vertex_normals(own.sum(1), torch.from_numpy(faces.astype(np.int64)))
-        return cls(own, middle, normals, float(radius), noise / float(radius), spread_nodes(own.sum(1).numpy(), NODES))
+        return cls(own, middle, normals, float(radius), spread_nodes(own.sum(1).numpy(), NODES))
+
+    def apart(self, one: State, other: State) -> float:
+        """Standard error of the motion [radii] by two halves: such errors in all coefficients, as the network was
+        trained on, make the same error of velocities across the surface at the window's end."""
+        a, b = (each.radius / self.radius * (each.own + each.middle) for each in (one, other))
+        off = 0.5 * torch.einsum("pkx,px->pk", a - b, self.normals)
+        rates = torch.tensor([float(k * (k + 1)) ** 2 for k in range(DEGREE + 1)]).double()
+        return float(((rates @ off.square().mean(0)) * (DEGREE + 1) / rates.sum()).sqrt())
 
     def later(self, network: Dynamics, found: Tensor, horizon: Tensor) -> Tensor:
         """[H, P, 3] m of all vertices; found: [n, POWERS, 3] what the network says of its nodes."""

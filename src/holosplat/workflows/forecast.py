@@ -17,9 +17,9 @@ from ..io.objects import write_object
 from ..methods.presets import SCHEMA
 from ..metrics import image_scores, intensity_range
 from ..motion.assimilate import carry_by_frames
-from ..motion.dynamics import DynamicsForecast, carry, window_of
+from ..motion.dynamics import DynamicsForecast, HybridForecast, window_of
 from ..motion.fit import MotionFit
-from ..motion.forecast import Forecast, Halves, History, PathForecast, decided
+from ..motion.forecast import Forecast, Forecaster, Halves, History, PathForecast, decided
 from ..motion.learned import GraphForecast
 from ..motion.measures import LEAST, half_sets
 from ..motion.modes import DmdForecast, SindyForecast
@@ -60,9 +60,9 @@ class ForecastOptions:
     dynamics: DynamicsForecast | None = None
     """How cells go on by mechanics (default: all bodies go on their paths)."""
     learned: GraphForecast | DmdForecast | SindyForecast | None = None
-    """How bodies go on by what was learnt, and not on their paths."""
+    """How bodies go on by what was learnt; with `dynamics`, by the mean of both."""
     decides: bool = False
-    """Whether paths decide against what was learnt, by the last third of the run's times."""
+    """Whether paths, what was learnt and the mean compete, by the last third of the run's times."""
     half_sets: bool = True
     """Whether paths are fitted again to two halves of the times, which say what is believed of the motion."""
     fit: MotionFit = field(default_factory=MotionFit)
@@ -75,9 +75,11 @@ class ForecastOptions:
         )
 
     @property
-    def way(self) -> str:
-        """Name of how bodies go on."""
-        return (self.dynamics or self.learned or self.model).kind
+    def way(self) -> Forecaster:
+        """How bodies go on, if it is not decided otherwise."""
+        if self.dynamics and self.learned:
+            return HybridForecast((self.learned, self.dynamics))
+        return self.dynamics or self.learned or self.model
 
     def ahead(self, tracked: np.ndarray) -> np.ndarray:
         """Times [N] s of the forecast after those of the run, `tracked` [T] s."""
@@ -88,13 +90,11 @@ class ForecastOptions:
 @dataclass(frozen=True)
 class Forecasted:
     """What `forecast` found. forecast: bodies and band; predicted: the frames at its times; judged: scores against the
-    frames that the run did not see, a row a time, empty without such frames; flow: what mechanics found of it;
-    decision: between paths and what was learnt."""
+    frames that the run did not see, a row a time, empty without such frames; decision: between paths and other ways."""
 
     forecast: Forecast
     predicted: Scan
     judged: list[dict[str, float]]
-    flow: dict[str, float] = field(default_factory=dict)
     decision: Decision | None = None
 
     def lines(self) -> list[str]:
@@ -104,8 +104,8 @@ class Forecasted:
         said = [f"standard error of surfaces: {band[0]:.3f} µm at {step:.4g} s, {band[-1]:.3f} µm at {last:.4g} s"]
         if self.decision is not None:
             said.append(self.decision.line)
-        if self.flow:
-            said.append(flow_in_words(self.flow))
+        if self.forecast.told:
+            said.append(flow_in_words(self.forecast.told))
         if self.judged:
             ends = [self.judged[0], self.judged[-1]]
             words = (f"SSIM {one['ssim']:.4f} (without change {one['ssim_still']:.4f})" for one in ends)
@@ -128,8 +128,8 @@ def require_cells(run: Reconstruction, times: np.ndarray, options: ForecastOptio
     """`InputError`, before any fit, where mechanics have no cell to carry on after the tracked `times` [T] s, and where
     what was learnt cannot be asked; `MissingError` without its library."""
     if options.dynamics is not None:
-        window_of(tracked_bodies(run), times, options.ahead(times), options.dynamics, options.model)
-    elif options.learned is not None and not options.decides:
+        window_of(tracked_bodies(run), times, options.ahead(times), options.dynamics)
+    if options.learned is not None and not options.decides:
         options.learned.fit(History(tracked_bodies(run), times, None)).ahead(options.ahead(times))
 
 
@@ -157,23 +157,32 @@ def forecast(
     require(len(last) > 0, f"the scan must have frames of the run's last time, {times[-1]:.6g} s, but it has none.")
     halves = _halves(run, known, bodies, options, seed, Run(journal), on_progress) if options.half_sets else None
     on_progress("forecast", 0.0, {})
-    flow = dict[str, float]()
-    decision = None
-    if options.dynamics is None:
-        history, way = History(bodies, times, halves), options.learned or options.model
-        if options.learned is not None and options.decides:
-            decision = decided(history, options.model, options.learned)
-            way = options.learned if decision.choice == options.learned.kind else options.model
-        found = way.fit(history).ahead(ahead)
-    elif options.dynamics.frames:
-        window = window_of(bodies, times, ahead, options.dynamics, options.model, halves)
-        found, flow = carry_by_frames(window, _evened(run, known)[0], run.oversample)
+    decision, way = None, options.way
+    history = History(bodies, times, halves)
+    if options.dynamics is not None and options.dynamics.frames:
+        window = window_of(bodies, times, ahead, options.dynamics, halves)
+        found = carry_by_frames(window, _evened(run, known)[0], run.oversample)
     else:
-        found, flow = carry(bodies, times, ahead, options.dynamics, options.model, halves)
+        if options.decides:
+            ways = {one.kind: one for one in _ways(options, history, ahead)}
+            decision = decided(history, options.model, list(ways.values())[1:])
+            way = ways[decision.choice]
+        found = way.fit(history).ahead(ahead)
     exposures = scan.exposures[last].repeated(ahead)
     frames = render_object(found.bodies, exposures, run.oversample, bodies.backend)
-    predicted = Scan(frames, exposures, np.zeros(len(frames), dtype=bool), {"forecast": options.way})
-    return Forecasted(found, predicted, _judged(found, run, scan, known, slack), flow, decision)
+    predicted = Scan(frames, exposures, np.zeros(len(frames), dtype=bool), {"forecast": way.kind})
+    return Forecasted(found, predicted, _judged(found, run, scan, known, slack), decision)
+
+
+def _ways(options: ForecastOptions, history: History, ahead: np.ndarray) -> list[Forecaster]:
+    """Those that compete, from simple to complex, without the network where it cannot be asked so far ahead."""
+    learned = options.learned
+    try:
+        if learned is not None:
+            learned.fit(history).ahead(ahead)
+    except InputError:
+        return [options.model, *([options.dynamics] if options.dynamics else [])]
+    return [options.model, *([learned] if learned else []), *([options.way] if options.dynamics else [])]
 
 
 def flow_in_words(flow: dict[str, float]) -> str:
@@ -213,7 +222,7 @@ def write_forecast(folder: RunFolder, run: Reconstruction, found: Forecasted) ->
             "times_s": said.times.tolist(),
             "band_m": band,
             "held_out": found.judged,
-            "flow": found.flow,
+            "flow": said.told,
             "decision": found.decision and found.decision.as_dict(),
         },
     )
@@ -236,7 +245,7 @@ def config_of(options: ForecastOptions, scan: Scan, run: dict[str, Any], seed: i
     return {
         "schema_version": SCHEMA,
         "method": {
-            **{"kind": options.kind, "of": run.get(RUN, ""), "forecast": options.way},
+            **{"kind": options.kind, "of": run.get(RUN, ""), "forecast": options.way.kind},
             **to_table(options),
         },
         "seed": seed,

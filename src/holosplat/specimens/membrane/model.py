@@ -60,14 +60,24 @@ def stretching_forces(shape: Shape, rest: RestShape, softening: float, linear: f
     return _gathered(shape.nodes, rest.edges, torch.stack([pulls, -pulls], dim=-2))
 
 
+THIN = 0.1
+"""Of the rest area of a triangle, below which bending does not grow stronger."""
+
+
 def bending_forces(shape: Shape, rest: RestShape, stiffness: float) -> Tensor:
-    """Of the hinges, by the gradient of the dihedral angle (Guckenberger et al. 2016, Comput. Phys. Commun. 207, 1)."""
+    """Of the hinges, by the gradient of the dihedral angle (Guckenberger et al. 2016, Comput. Phys. Commun. 207, 1).
+
+    A triangle without area has no direction: one of less than `THIN` of its rest area has the levers of that much.
+    """
     (a, b), (c, d) = (shape.nodes[..., pair, :].unbind(-2) for pair in (rest.edges, rest.opposite))
     edge = b - a
     length = edge.norm(dim=-1, keepdim=True)
     first, second = shape.normals[..., rest.beside, :].unbind(-2)
     turn = stiffness * (angle_between(edge, first, second) - rest.angle).unsqueeze(-1)
-    first, second = (turn * n / (n**2).sum(-1, keepdim=True) for n in (first, second))
+    least = (2 * THIN * rest.area[rest.beside].unsqueeze(-1)) ** 2
+    first, second = (
+        turn * n / (n**2).sum(-1, keepdim=True).clamp(min=low) for n, low in zip((first, second), least.unbind(-2))
+    )
     on_a = -(((b - c) * edge).sum(-1, keepdim=True) * first + ((b - d) * edge).sum(-1, keepdim=True) * second) / length
     on_b = -(((c - a) * edge).sum(-1, keepdim=True) * first + ((d - a) * edge).sum(-1, keepdim=True) * second) / length
     forces = torch.stack([on_a, on_b, length * first, length * second], dim=-2)
@@ -78,7 +88,7 @@ def area_forces(shape: Shape, rest: RestShape, local: float, whole: float) -> Te
     """Of the tension k (A - A₀)/A₀ in each triangle and k (S - S₀)/S₀ in all of them, moduli [N/m]."""
     areas = shape.areas
     tension = local * (areas / rest.area - 1)
-    tension = tension + whole * (areas.sum(-1, keepdim=True) / rest.surface - 1)
+    tension = tension + whole * (areas.sum(-1) / rest.surface - 1).unsqueeze(-1)
     unit = 0.5 * shape.normals / areas.unsqueeze(-1)
     pull = 0.5 * tension.unsqueeze(-1) * unit
     a, b, c = shape.corners.unbind(-2)
