@@ -18,10 +18,19 @@ from holosplat.inference import Decision, Score
 from holosplat.matter import DeltaBeta, MaterialPrior, Matter
 from holosplat.methods import Auto, Gaussians, Method, Task, settled
 from holosplat.methods.cross_validation import MissingMatter
-from holosplat.methods.levels import CONTINUOUS, LEVELS, SHOWN, TrialFits, decide_matter, flattened
+from holosplat.methods.levels import (
+    CONTINUOUS,
+    LEVELS,
+    SHOWN,
+    TrialFits,
+    at_ratio_of_one,
+    decide_matter,
+    flattened,
+    ratio_of_one,
+)
 from holosplat.methods.method import first_of_task
 from holosplat.methods.trials import WITHOUT, plain_light
-from holosplat.methods.uncertain import Determined
+from holosplat.methods.uncertain import LIKELY_RATIOS, Determined
 from holosplat.optics.background import LightOptions
 from holosplat.representations import Stored, VoxelGrid
 from holosplat.scan import Exposures, Scan
@@ -193,11 +202,49 @@ def test_kinds_are_compared_at_the_likeliest_ratio(soft, monkeypatch, is_lit, ra
         return VoxelGrid(torch.zeros((1, *grid.shape)), grid, Matter.one(*MATERIAL))
 
     place = import_module("holosplat.methods.levels")
-    likeliest = Determined("delta_beta", 777.0, 700.0, 800.0, (1.0, 1e6), True, "")
-    monkeypatch.setattr(place, "likeliest_ratio", lambda task: likeliest)
+    monkeypatch.setattr(place, "ratio_of_one", lambda task, first: (likely(777.0), None))
     monkeypatch.setattr(place, "solve_stages", fitted)
     TrialFits(task, first, {"continuous": Auto().volume}).score("as measured", "continuous", 0)
     assert seen == [pytest.approx(ratio)]
+
+
+def likely(ratio: float) -> Determined:
+    return Determined("delta_beta", ratio, 0.9 * ratio, 1.1 * ratio, LIKELY_RATIOS, True)
+
+
+@pytest.mark.parametrize("kind", ["soft", "sharp"])
+@pytest.mark.parametrize(("true", "likeliest"), [(300.0, 300.0), (1e6, 300.0), (300.0, LIKELY_RATIOS[1])])
+def test_absorption_is_taken_where_it_predicts_unseen_views(kind, true, likeliest, monkeypatch):
+    """Of matter that absorbs, and not of matter that does not, whatever explains the fitted frames."""
+    material = DeltaBeta(MATERIAL.delta, MATERIAL.delta / true)
+    size = (40e-6, 38e-6, 40e-6)
+    cells = soft_cells(4, (14e-6, 20e-6), size, material, seed=5, edge=3e-6)
+    sharp = MeshScene.of_one_material(random_cells(4, size, 5, 17e-6), material)
+    task = Task(measured(cells if kind == "soft" else sharp), MaterialPrior.unknown(1))
+    place = import_module("holosplat.methods.levels")
+    monkeypatch.setattr(place, "likeliest_ratio", lambda task: likely(likeliest))
+    there, decision = at_ratio_of_one(task, first_of_task(task))
+    found, again = ratio_of_one(task, there)
+    assert again is decision
+    assert (decision.name, decision.by) == ("δ/β", "views set aside")
+    assert found.value == (likeliest if true == likeliest else LIKELY_RATIOS[1])
+    assert there.material.ratio == pytest.approx(found.value)
+    if likeliest < LIKELY_RATIOS[1] and found.value != likeliest:
+        assert not found.told
+        assert (found.low, found.high) == (0.9 * likeliest, LIKELY_RATIOS[1])
+        assert decision.line == found.remark
+
+
+def test_a_ratio_is_found_again_in_other_light(soft, monkeypatch):
+    asked = list[Task]()
+    place = import_module("holosplat.methods.levels")
+    monkeypatch.setattr(place, "likeliest_ratio", lambda task: asked.append(task) or likely(LIKELY_RATIOS[1]))
+    task = Task(soft, MaterialPrior.unknown(1))
+    first = first_of_task(task)
+    for taken in ((), (), ("fixed pattern",), ()):
+        first.taken = taken
+        ratio_of_one(task, first)
+    assert len(asked) == 2
 
 
 def test_a_fit_that_finds_no_matter_predicts_frames_without_any(soft, monkeypatch):
