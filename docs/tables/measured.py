@@ -140,6 +140,21 @@ def cell() -> str:
     return markdown((*head, "processor / s"), lines)
 
 
+@table("nothing-told", "python benchmarks/nothing_told.py --data FOLDER", "half an hour", "nothing_told.csv")
+def nothing_told() -> str:
+    """Scenes of which nothing is told, before and after absorption became a hypothesis."""
+    rows = read("nothing_told.csv")
+    old = {(r["family"], r["seed"]): r for r in rows if r["commit"] == "198a344"}
+    lines = list[list[str]]()
+    for row in (r for r in rows if r["commit"] != "198a344"):
+        before = old[row["family"], row["seed"]]
+        ratios = (rounded(r["found"], 0) if r["found"] != "nan" else "two levels" for r in (before, row))
+        values = (rounded(r[name], digits) for name, digits in (("error", 3), ("seconds", 0)) for r in (before, row))
+        lines.append([row["family"], row["seed"], row["use"], rounded(row["true"], 0), *ratios, *values])
+    head = ("family", "seed", "made on", "true δ/β", "before", "now", "error before", "now")
+    return markdown((*head, "processor before / s", "now / s"), sorted(lines, key=lambda one: one[2]))
+
+
 @table("gpu", "python benchmarks/gpu.py --csv docs/data/gpu.csv", "a minute, with a GPU", "gpu.csv")
 def gpu() -> str:
     """Kernels, and steps of a fit, on a GPU."""
