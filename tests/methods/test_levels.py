@@ -235,15 +235,28 @@ def test_absorption_is_taken_where_it_predicts_unseen_views(kind, true, likelies
         assert decision.line == found.remark
 
 
+def test_an_estimate_stands_where_the_likelihood_tells_none(soft, monkeypatch):
+    place = import_module("holosplat.methods.levels")
+    monkeypatch.setattr(place, "likeliest_ratio", lambda task: replace(likely(300.0), told=False))
+    task = Task(soft, MaterialPrior.unknown(1))
+    first = first_of_task(task)
+    there, decision = at_ratio_of_one(task, first)
+    assert there is first
+    assert (decision.choice, decision.compared) == ("300", ())
+    assert ratio_of_one(task, first)[0].value == 300.0
+
+
 def test_a_ratio_is_found_again_in_other_light(soft, monkeypatch):
+    """As the likelihood has it: light that was found at one δ/β speaks for this."""
     asked = list[Task]()
     place = import_module("holosplat.methods.levels")
-    monkeypatch.setattr(place, "likeliest_ratio", lambda task: asked.append(task) or likely(LIKELY_RATIOS[1]))
+    monkeypatch.setattr(place, "likeliest_ratio", lambda task: asked.append(task) or likely(3000.0))
     task = Task(soft, MaterialPrior.unknown(1))
     first = first_of_task(task)
     for taken in ((), (), ("fixed pattern",), ()):
         first.taken = taken
-        ratio_of_one(task, first)
+        found = ratio_of_one(task, first)
+        assert (found[1].by == "the likeliest") is bool(taken)
     assert len(asked) == 2
 
 

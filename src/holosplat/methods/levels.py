@@ -24,12 +24,13 @@ from ..representations import Stored, VoxelGrid
 from .contrast import without_matter
 from .cross_validation import BY_FISSION, EFFORT, FirstVolumes, predictions
 from .method import Method, Task, first_of_task, solve_stages
-from .trials import WITHOUT, Hypothesis, Trial, Trials, accepted, hypothesis_of, name_of
+from .trials import NULL, WITHOUT, Hypothesis, Trial, Trials, accepted, hypothesis_of, name_of
 from .uncertain import LIKELY_RATIOS, Determined, likeliest_ratio
 
 STAGE = "levels or continuous matter"
 SHOWN = "matter in first volumes"
 NAME, RATIO = "matter", "δ/β"
+ESTIMATED, LIKELIEST = "an estimate, for the likelihood tells none", "the likeliest"
 LEVELS = ("one level", "two levels")
 SEVERAL = "several levels"
 CONTINUOUS = "continuous"
@@ -157,33 +158,37 @@ def ratio_of_one(task: Task, first: FirstVolumes) -> tuple[Determined, Decision]
 
     The null is the largest of `LIKELY_RATIOS`, of matter that absorbs least. The likeliest one (`likeliest_ratio`) is
     taken where first volumes of such matter predict unseen frames better: what explains the fitted ones by absorption
-    may be whatever else the model lacks.
+    may be whatever else the model lacks. In light or noise that was taken, which was found at the first of them, the
+    likeliest stands; and an estimate where the likelihood tells none.
     """
     return first.once(("ratio", first.taken), 0, lambda: _ratio_of_one(task, first))
 
 
 def _ratio_of_one(task: Task, first: FirstVolumes) -> tuple[Determined, Decision]:
     found = likeliest_ratio(task)
+    if first.taken or not found.told:
+        return found, Decision(RATIO, f"{found.value:.4g}", LIKELIEST if found.told else ESTIMATED)
     most = LIKELY_RATIOS[1]
     tried = {f"{each.value:.4g}": each for each in (replace(found, value=most, high=most, told=False), found)}
-    volumes = {name: first.at_ratio(each.value) for name, each in tried.items()}
+    trials = {name: Trials(first.at_ratio(each.value), task.light) for name, each in tried.items()}
 
     def scored(name: str, fold: int) -> Score:
-        light, (seen, unseen) = accepted(task, first, fold).light, first.folds.split(fold)
         try:
-            volume = volumes[name].volume(fold, light)
+            return trials[name].score(NULL, fold)
         except InputError:  # there is no such matter
             return without_matter(first, fold)
-        return Trial(volume, light, seen, unseen, predictions(volume, unseen)).score(light)
 
     decision = select(RATIO, tuple(tried), scored, first.folds.count, by=first.folds.by)
     chosen = tried[decision.choice]
-    return (chosen if chosen is found else replace(chosen, remark=f"{decision.line}")), decision
+    return (chosen if chosen is found else replace(chosen, remark=decision.line)), decision
 
 
 def at_ratio_of_one(task: Task, first: FirstVolumes) -> tuple[FirstVolumes, Decision]:
-    """The first volumes of a task of which nothing is known, of a material with `ratio_of_one`, and its decision."""
+    """The first volumes of a task of which nothing is known, of a material with `ratio_of_one`, and its decision; the
+    same where that is an estimate, as theirs is."""
     found = ratio_of_one(task, first)
+    if found[1].by == ESTIMATED:
+        return first, found[1]
     there = first.at_ratio(found[0].value)
     there.once(("ratio", first.taken), 0, lambda: found)
     return there, found[1]
