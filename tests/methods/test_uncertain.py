@@ -34,7 +34,7 @@ from holosplat.methods.uncertain import (
 
 RATIO = MaterialPrior.of_ratio(MATERIAL.ratio)
 QUICK = ProfileOptions(
-    iterations=15, start=HolographicTV(retrieval=15, iterations=30, corrections=0, noisy=1.0, refine=1, upper=0.0)
+    iterations=5, start=HolographicTV(retrieval=15, iterations=30, corrections=0, noisy=1.0, refine=1, upper=0.0)
 )
 
 

@@ -74,7 +74,7 @@ class ProfileOptions:
             retrieval=40, iterations=100, corrections=2, noisy=1.0, refine=1, upper=0.0
         )
     )
-    """The volume that tells the support, and that every fit starts from."""
+    """The volume that each fit starts from."""
     prior: ContinuousPrior = field(default_factory=lambda: ContinuousPrior(slopes=0.1, values=0.005))
     """What is expected of matter: less than of a volume that is to be looked at, for what is expected pulls constants
     towards those that need fewer slopes; here the support does most."""
@@ -127,7 +127,6 @@ class Profile:
             first = self._placed(whole)
         inside = without_specks(first, (first > options.faint * plateau(first)).numpy())
         self.support = torch.from_numpy(np.asarray(binary_dilation(inside, iterations=max(1, options.dilated))))
-        self._nominal, self._start = nominal, first * self.support
         self._peak = plateau(first) / float((first * self.support).sum() / self.support.sum())
         """The level of matter over its mean in the support. The prior's unit must not vary by chance from fit to fit,
         as a plateau does, for the larger it is, the likelier are all slopes."""
@@ -192,17 +191,16 @@ class Profile:
     def _of(self, chosen: np.ndarray) -> Profile:
         part = copy(self)
         part._scan, part._noise = self._scan[np.flatnonzero(chosen)], self._noise[np.flatnonzero(chosen)]
-        with memory_kept():
-            part._start = part._placed(part._volume(part.frames(part._nominal))) * part.support
         return part
 
     def fitted(self, constants: Constants) -> tuple[Tensor, float]:
         """The likeliest volume in the support, and ½ χ² and prior."""
         with memory_kept():
             frames, options = self.frames(constants), self.options
+            u = self._placed(self._volume(frames)) * self.support
             on = frames.instrument.device
             values = [frames(torch.zeros(len(frames.field), *frames.field.shape, device=on)).value]
-            u = self._start.to(on)
+            u = u.to(on)
             for _ in range(2):
                 if bool((u > 0).any()):
                     level = self._peak * float(u.sum() / self.support.sum())
