@@ -17,7 +17,7 @@ from pathlib import Path
 
 import torch
 from families import MADE_ON, METHOD
-from family_scenes import scene
+from family_scenes import Scene, scene
 from machine import commit
 from rows import machine, read, replaced, shown
 
@@ -56,9 +56,9 @@ class Row:
     machine: str
 
 
-def run(family: str, seed: int, data: Path) -> Row:
+def run(made: Scene, family: str, seed: int) -> Row:
     """The default on one scene, without its material."""
-    made, began = scene(family, seed, data), time.process_time()
+    began = time.process_time()
     done = hs.reconstruct(made.scan, hs.MaterialPrior.unknown(), METHOD)
     seconds = round(time.process_time() - began, 1)
     prior = made.prior
@@ -82,7 +82,11 @@ def main() -> None:
         for seed in options.seeds or [SCENES[family]]:
             if (family, str(seed), commit()) in {(r["family"], r["seed"], r["commit"]) for r in read(options.out)}:
                 continue
-            row = run(family, seed, options.data)
+            made = scene(family, seed, options.data)
+            if isinstance(made, str):
+                print(made)
+                continue
+            row = run(made, family, seed)
             replaced(options.out, row, key=3)
             shown(row)
 
