@@ -35,7 +35,7 @@ SCENES = {
     "uneven light": 1,
     "absorbers": 105,
 }
-DECISIONS = ("δ/β", "light and noise", "matter")
+DECISIONS = ("δ/β in frames as measured", "light and noise", "matter")
 
 
 @dataclass(frozen=True)

@@ -127,6 +127,7 @@ def test_what_cannot_be_carried_on_is_refused(folder):
     refused(holosplat("forecast", run, "--out", folder / "later"), "later")
     refused(holosplat("forecast", run, "--by", "mechanics", "--out", out), "--by mechanics", "--channel")
     refused(holosplat("forecast", run, "--by", "graph", "--out", out), "6 times at least", "--by paths")
+    refused(holosplat("forecast", run, "--weights", folder / "scan.nxs", "--out", out), "scan.nxs", "safetensors file")
     refused(holosplat("forecast", run, "--by", "sindy", "--out", out), "9 times at least", "--by paths")
     through = ("forecast", run, "--out", out, "--channel", "1e-5", "1e-5")
     refused(holosplat(*through), "within the channel", "--flow-axis")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib import import_module
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,7 +14,7 @@ from holosplat.baselines import holographic_tv
 from holosplat.beamline.light import UnevenLight, correlated_field
 from holosplat.beamline.simulate import simulate
 from holosplat.geometry import Views
-from holosplat.inference import Score
+from holosplat.inference import Decision, Score
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import Auto, SmoothVolume, Task, trials
 from holosplat.methods.cross_validation import BY_FISSION, BY_VIEWS, FirstVolumes, Folds
@@ -232,6 +233,37 @@ def test_light_that_the_frames_of_a_later_fold_do_not_show_adds_nothing_there(sh
     here, there = (tried.score(UNEVEN, fold).gain_over(tried.score(NULL, fold))[0] for fold in (0, 1))
     assert here > 0
     assert there == 0
+
+
+@pytest.mark.parametrize(
+    ("method", "prior", "is_asked"),
+    [
+        (Auto(), MaterialPrior.unknown(1), True),
+        (SmoothVolume(), MaterialPrior.unknown(1), True),
+        (None, MaterialPrior.unknown(1), False),
+        (Auto(), PRIOR, False),
+        (Auto(), MaterialPrior.unknown().on_both_sides(), False),
+    ],
+    ids=["default", "volume", "no method", "ratio told", "both sides"],
+)
+def test_absorption_is_decided_before_light_where_nothing_is_known(soft, method, prior, is_asked, monkeypatch):
+    order, decision = list[str](), Decision("δ/β", "700", "views set aside")
+
+    def found(task, first):
+        order.append("ratio")
+        return first.at_ratio(700.0), (decision,)
+
+    def lit(first, *_):
+        order.append("light")
+        assert (first.material.ratio == pytest.approx(700.0)) is is_asked
+        return (), ()
+
+    place = import_module("holosplat.methods.illumination")
+    monkeypatch.setattr(place, "decide_ratio", found)
+    monkeypatch.setattr(place, "decided", lit)
+    monkeypatch.setattr(place, "_may_have_both_sides", lambda *_: False)
+    assert (decision in prepared(Task(soft, prior), method).decisions) is is_asked
+    assert order == ["ratio"] * is_asked + ["light"]
 
 
 def test_what_is_told_is_not_decided(soft):

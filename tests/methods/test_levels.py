@@ -23,8 +23,8 @@ from holosplat.methods.levels import (
     LEVELS,
     SHOWN,
     TrialFits,
-    at_ratio_of_one,
     decide_matter,
+    decide_ratio,
     flattened,
     ratio_of_one,
 )
@@ -202,7 +202,7 @@ def test_kinds_are_compared_at_the_likeliest_ratio(soft, monkeypatch, is_lit, ra
         return VoxelGrid(torch.zeros((1, *grid.shape)), grid, Matter.one(*MATERIAL))
 
     place = import_module("holosplat.methods.levels")
-    monkeypatch.setattr(place, "ratio_of_one", lambda task, first: (likely(777.0), None))
+    monkeypatch.setattr(place, "ratio_of_one", lambda task, first: likely(777.0))
     monkeypatch.setattr(place, "solve_stages", fitted)
     TrialFits(task, first, {"continuous": Auto().volume}).score("as measured", "continuous", 0)
     assert seen == [pytest.approx(ratio)]
@@ -223,10 +223,9 @@ def test_absorption_is_taken_where_it_predicts_unseen_views(kind, true, likelies
     task = Task(measured(cells if kind == "soft" else sharp), MaterialPrior.unknown(1))
     place = import_module("holosplat.methods.levels")
     monkeypatch.setattr(place, "likeliest_ratio", lambda task: likely(likeliest))
-    there, decision = at_ratio_of_one(task, first_of_task(task))
-    found, again = ratio_of_one(task, there)
-    assert again is decision
-    assert (decision.name, decision.by) == ("δ/β", "views set aside")
+    there, (decision,) = decide_ratio(task, first_of_task(task))
+    found = ratio_of_one(task, there)
+    assert (decision.name, decision.by) == ("δ/β in frames as measured", "views set aside")
     assert found.value == (likeliest if true == likeliest else LIKELY_RATIOS[1])
     assert there.material.ratio == pytest.approx(found.value)
     if likeliest < LIKELY_RATIOS[1] and found.value != likeliest:
@@ -240,10 +239,8 @@ def test_an_estimate_stands_where_the_likelihood_tells_none(soft, monkeypatch):
     monkeypatch.setattr(place, "likeliest_ratio", lambda task: replace(likely(300.0), told=False))
     task = Task(soft, MaterialPrior.unknown(1))
     first = first_of_task(task)
-    there, decision = at_ratio_of_one(task, first)
-    assert there is first
-    assert (decision.choice, decision.compared) == ("300", ())
-    assert ratio_of_one(task, first)[0].value == 300.0
+    assert decide_ratio(task, first) == (first, ())
+    assert ratio_of_one(task, first).value == 300.0
 
 
 def test_a_ratio_is_found_again_in_other_light(soft, monkeypatch):
@@ -255,8 +252,8 @@ def test_a_ratio_is_found_again_in_other_light(soft, monkeypatch):
     first = first_of_task(task)
     for taken in ((), (), ("fixed pattern",), ()):
         first.taken = taken
-        found = ratio_of_one(task, first)
-        assert (found[1].by == "the likeliest") is bool(taken)
+        there, decisions = decide_ratio(task, first)
+        assert (there is first) is (decisions == ()) is bool(taken)
     assert len(asked) == 2
 
 

@@ -117,6 +117,21 @@ def test_two_constants_that_frames_tell_are_both_found():
     assert distance.low < 0.12 < distance.high < 0.14
 
 
+@pytest.mark.parametrize(("noise_share", "most"), [(0.0, 20), (0.25, 12)])
+def test_a_search_is_no_finer_than_its_systematic_error(noise_share, most):
+    asked = list[float]()
+
+    def valley(constants):
+        asked.append(constants["delta_beta"])
+        return 3000 * math.log(constants["delta_beta"] / 1350.0) ** 2
+
+    valley.noise_share = noise_share
+    ranges = {"delta_beta": (60.0, 20_000.0)}
+    (found,) = Search(valley, ranges, Task(blob_scan(count=2), MaterialPrior.unknown())).run()
+    assert found.value == pytest.approx(1350.0, rel=0.05)
+    assert len(asked) <= most
+
+
 def test_two_constants_that_frames_tell_only_together_are_said_to_be():
     distance, ratio = searched(0.0)
     assert not distance.told

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -40,6 +41,7 @@ from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.specimens.red_cells import icosphere
 from holosplat.training.dynamics import DynamicsTraining, FlowSeries, _noise, draw_lesson, train_dynamics
 from holosplat.training.options import TrainOptions
+from holosplat.workflows.forecast import ForecastOptions, _others, require_cells
 
 SPHERE, FACES = icosphere(2)
 TIMES = 1e-5 * np.arange(12)
@@ -206,6 +208,20 @@ def test_what_cannot_be_foretold_is_refused(untrained, tmp_path):
     (tmp_path / "other.safetensors").write_bytes(b"no weights")
     with pytest.raises(InputError, match="must be a safetensors file"):
         learned(History(straight(), TIMES), AHEAD, GraphForecast(str(tmp_path / "other.safetensors")))
+    run = SimpleNamespace(object=straight())
+    options = ForecastOptions(learned=GraphForecast(str(tmp_path / "other.safetensors")), decides=True)
+    with pytest.raises(InputError, match="must be a safetensors file"):
+        require_cells(run, TIMES, options)  # type: ignore[arg-type]
+
+
+def test_a_network_that_cannot_look_so_far_is_left_out_and_said_to_be(untrained):
+    options = ForecastOptions(learned=GraphForecast(untrained), decides=True)
+    history = History(straight(), TIMES)
+    others, left_out = _others(options, history, TIMES[-1] + np.array([2e-4]))
+    assert others == []
+    assert "graph was not asked" in left_out
+    assert "fewer --times" in left_out
+    assert _others(options, history, AHEAD) == ([options.learned], "")
 
 
 def test_paths_and_the_network_are_decided_by_times_that_neither_saw(untrained):

@@ -28,7 +28,7 @@ from .contrast import STAGE as SIGN
 from .contrast import Scoring, decide_sides, decide_sign, with_sign
 from .cross_validation import BY_FISSION, EFFORT, FirstVolumes, predicted_frames
 from .ground import assumed_material
-from .levels import SHOWN, TrialFits, at_ratio_of_one, blind
+from .levels import SHOWN, TrialFits, blind, decide_ratio
 from .method import Method, Task, first_of_task
 from .trials import UNEVEN, WITHOUT, Hypothesis, Trials, name_of, named, plain_light, rivals, with_more
 from .volume import SmoothVolume
@@ -138,36 +138,27 @@ def prepared(task: Task, method: Method | None = None, before: Prepared | None =
     if handed is not None and options.kind != "even":
         return replace(task, lit=Light.handed(frames, options, handed))
     light = plain_light(frames, options)
-    open_to = [
-        one
-        for one, free in (
-            ("fixed pattern", options.still == "auto" and options.kind != "even" and not still_order(method)),
-            (FLUX, options.kind == "auto" and not task.scan.is_series),  # several times have no one volume
-            (UNEVEN, options.kind == "auto"),
-            ("correlated noise", options.noise == "auto"),
-        )
-        if free
-    ]
+    open_to = _open_to(task, method)
     told = tuple([UNEVEN] * (options.kind == "smooth"))
     if before is None:
         spherical = isinstance(method, Auto | SmoothVolume)
         free = spherical and not (task.prior.fixes_ratio or task.prior.two_sided or task.scan.is_series)
         if free:  # light and noise would make up for a wrong δ/β, so they are compared after it
-            first, ratio = at_ratio_of_one(task, first)
-            task = replace(task, decisions=(*task.decisions, ratio))
+            first, ratio = decide_ratio(task, first)
+            task = replace(task, decisions=(*task.decisions, *ratio))
         task.on_progress(STAGE, 0.0)
-        first.taken, made = decided(first, options, told, tuple(open_to))
+        first.taken, made = decided(first, options, told, open_to)
         if _may_have_both_sides(task, method) and (spherical or first.folds.by != BY_FISSION):
             first, sides = decide_sides(first, options, told, spherical)
             task = replace(task, prior=with_sign(task.prior, (sides,)), decisions=(*task.decisions, sides))
             if task.prior.two_sided:
-                first.taken, made = decided(first, options, told, tuple(open_to))
+                first.taken, made = decided(first, options, told, open_to)
         shown = None if method is None or method.of_series or not made else shows_matter(first, options, first.taken)
         if isinstance(method, Auto) and shown is not None and blind([shown]):
             kinds = method.with_effort(EFFORT).kinds
             alone: dict[MatterKind, Method] = {"continuous": kinds["continuous"]}
             scored = by_fits(task, first, alone if task.prior.two_sided else kinds)
-            first.taken, again = decided(first, options, told, tuple(open_to), scored)
+            first.taken, again = decided(first, options, told, open_to, scored)
             made = (*made, shown, *again)
         elif method is not None and first.taken != told and not method.of_series:
             decision = confirmed(task, first, told)
@@ -179,6 +170,18 @@ def prepared(task: Task, method: Method | None = None, before: Prepared | None =
         first.taken, made = before[0], tuple(each for each in before[1] if each.name != SIGN)
     scan, light = _applied(task, light, first.taken)
     return replace(task, scan=scan, lit=light, decisions=(*task.decisions, *made), first=first)
+
+
+def _open_to(task: Task, method: Method | None) -> Hypothesis:
+    """The hypotheses that are asked for."""
+    options = task.light
+    asked = {
+        "fixed pattern": options.still == "auto" and options.kind != "even" and not still_order(method),
+        FLUX: options.kind == "auto" and not task.scan.is_series,  # several times have no one volume
+        UNEVEN: options.kind == "auto",
+        CORRELATED: options.noise == "auto",
+    }
+    return tuple(one for one, free in asked.items() if free)
 
 
 def _may_have_both_sides(task: Task, method: Method | None) -> bool:

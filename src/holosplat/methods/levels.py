@@ -29,8 +29,7 @@ from .uncertain import LIKELY_RATIOS, Determined, likeliest_ratio
 
 STAGE = "levels or continuous matter"
 SHOWN = "matter in first volumes"
-NAME, RATIO = "matter", "δ/β"
-ESTIMATED, LIKELIEST = "an estimate, for the likelihood tells none", "the likeliest"
+NAME, RATIO = "matter", "δ/β in frames as measured"
 LEVELS = ("one level", "two levels")
 SEVERAL = "several levels"
 CONTINUOUS = "continuous"
@@ -141,7 +140,7 @@ class TrialFits:
         prior = task.prior
         if not (prior.fixes_ratio or two):
             known = task.lit is not None
-            ratio = ratio_of_one(task, self._first)[0].value if known else self._first.material.ratio
+            ratio = ratio_of_one(task, self._first).value if known else self._first.material.ratio
             prior = prior.with_ratio(ratio)
         fitted = replace(task, scan=seen, prior=prior, lit=trial.light, matter=kind, first=None)
         if fitted.bounded and not prior.materials and "continuous" in self._methods:
@@ -153,21 +152,35 @@ class TrialFits:
             return None
 
 
-def ratio_of_one(task: Task, first: FirstVolumes) -> tuple[Determined, Decision]:
-    """δ/β where nothing is known and all matter has one, and its decision, made once for what was taken of light.
+def ratio_of_one(task: Task, first: FirstVolumes) -> Determined:
+    """δ/β where nothing is known and all matter has one, found once for what was taken of light (`decide_ratio`)."""
+    return _ratio(task, first)[0]
+
+
+def decide_ratio(task: Task, first: FirstVolumes) -> tuple[FirstVolumes, tuple[Decision, ...]]:
+    """First volumes of a task of which nothing is known at its δ/β, and whether frames as measured need that.
 
     The null is the largest of `LIKELY_RATIOS`, of matter that absorbs least. The likeliest one (`likeliest_ratio`) is
     taken where first volumes of such matter predict unseen frames better: what explains the fitted ones by absorption
-    may be whatever else the model lacks. In light or noise that was taken, which was found at the first of them, the
-    likeliest stands; and an estimate where the likelihood tells none.
+    may be whatever else the model lacks. An estimate stands where the likelihood tells none; and the likeliest in light
+    or noise that was taken, for these were found at the first δ/β. In both cases nothing is decided.
     """
-    return first.once(("ratio", first.taken), 0, lambda: _ratio_of_one(task, first))
+    found, decision = _ratio(task, first)
+    if decision is None:
+        return first, ()
+    there = first.at_ratio(found.value)
+    there.once(("ratio", first.taken), 0, lambda: (found, decision))
+    return there, (decision,)
 
 
-def _ratio_of_one(task: Task, first: FirstVolumes) -> tuple[Determined, Decision]:
+def _ratio(task: Task, first: FirstVolumes) -> tuple[Determined, Decision | None]:
+    return first.once(("ratio", first.taken), 0, lambda: _compared(task, first))
+
+
+def _compared(task: Task, first: FirstVolumes) -> tuple[Determined, Decision | None]:
     found = likeliest_ratio(task)
     if first.taken or not found.told:
-        return found, Decision(RATIO, f"{found.value:.4g}", LIKELIEST if found.told else ESTIMATED)
+        return found, None
     most = LIKELY_RATIOS[1]
     tried = {f"{each.value:.4g}": each for each in (replace(found, value=most, high=most, told=False), found)}
     trials = {name: Trials(first.at_ratio(each.value), task.light) for name, each in tried.items()}
@@ -180,18 +193,7 @@ def _ratio_of_one(task: Task, first: FirstVolumes) -> tuple[Determined, Decision
 
     decision = select(RATIO, tuple(tried), scored, first.folds.count, by=first.folds.by)
     chosen = tried[decision.choice]
-    return (chosen if chosen is found else replace(chosen, remark=decision.line)), decision
-
-
-def at_ratio_of_one(task: Task, first: FirstVolumes) -> tuple[FirstVolumes, Decision]:
-    """The first volumes of a task of which nothing is known, of a material with `ratio_of_one`, and its decision; the
-    same where that is an estimate, as theirs is."""
-    found = ratio_of_one(task, first)
-    if found[1].by == ESTIMATED:
-        return first, found[1]
-    there = first.at_ratio(found[0].value)
-    there.once(("ratio", first.taken), 0, lambda: found)
-    return there, found[1]
+    return (chosen if chosen.told else replace(chosen, remark=decision.line)), decision
 
 
 def blind(decisions: Iterable[Decision]) -> bool:

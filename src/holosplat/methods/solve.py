@@ -91,7 +91,7 @@ def settled(
         one = one or (decision.choice == LEVELS[0] and len(decision.compared) > 0)
         method = method.suited(kind)
     if one and not task.prior.fixes_ratio:
-        constants = (*constants, ratio_of_one(task, first_of_task(task))[0])
+        constants = (*constants, ratio_of_one(task, first_of_task(task)))
     return Settled(method, kind, decision, constants)
 
 

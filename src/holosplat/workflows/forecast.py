@@ -126,7 +126,9 @@ def tracked_bodies(run: Reconstruction) -> MovingSurfaces:
 
 def require_cells(run: Reconstruction, times: np.ndarray, options: ForecastOptions) -> None:
     """`InputError`, before any fit, where mechanics have no cell to carry on after the tracked `times` [T] s, and where
-    what was learnt cannot be asked; `MissingError` without its library."""
+    what was learnt cannot be asked, or is no network; `MissingError` without its library."""
+    if isinstance(options.learned, GraphForecast):
+        _ = options.learned.trained
     if options.dynamics is not None:
         window_of(tracked_bodies(run), times, options.ahead(times), options.dynamics)
     if options.learned is not None and not options.decides:
@@ -164,9 +166,10 @@ def forecast(
         found = carry_by_frames(window, _evened(run, known)[0], run.oversample)
     else:
         if options.decides:
-            ways = {one.kind: one for one in _ways(options, history, ahead)}
-            decision = decided(history, options.model, list(ways.values())[1:])
-            way = ways[decision.choice]
+            others, left_out = _others(options, history, ahead)
+            decision = decided(history, options.model, others)
+            decision = replace(decision, by=decision.by + left_out)
+            way = {one.kind: one for one in (options.model, *others)}[decision.choice]
         found = way.fit(history).ahead(ahead)
     exposures = scan.exposures[last].repeated(ahead)
     frames = render_object(found.bodies, exposures, run.oversample, bodies.backend)
@@ -174,15 +177,16 @@ def forecast(
     return Forecasted(found, predicted, _judged(found, run, scan, known, slack), decision)
 
 
-def _ways(options: ForecastOptions, history: History, ahead: np.ndarray) -> list[Forecaster]:
-    """Those that compete, from simple to complex, without the network where it cannot be asked so far ahead."""
-    learned = options.learned
+def _others(options: ForecastOptions, history: History, ahead: np.ndarray) -> tuple[list[Forecaster], str]:
+    """What competes with paths, from simple to complex; and why the network does not, where it cannot look so far."""
+    mechanics: list[Forecaster] = [options.dynamics] if options.dynamics else []
+    if options.learned is None:
+        return mechanics, ""
     try:
-        if learned is not None:
-            learned.fit(history).ahead(ahead)
-    except InputError:
-        return [options.model, *([options.dynamics] if options.dynamics else [])]
-    return [options.model, *([learned] if learned else []), *([options.way] if options.dynamics else [])]
+        options.learned.fit(history).ahead(ahead)
+    except InputError as error:
+        return mechanics, f"; {options.learned.kind} was not asked: {error}"
+    return [options.learned, *([options.way] if mechanics else [])], ""
 
 
 def flow_in_words(flow: dict[str, float]) -> str:
