@@ -292,11 +292,6 @@ class GraphForecast:
     keep_volume: bool = True
     """Whether bodies keep the mean volume of the window."""
 
-    @property
-    def trained(self) -> LearnedDynamics:
-        """The network; `InputError` for a file that holds none."""
-        return read_dynamics(Path(self.weights)) if self.weights else read_dynamics()
-
     def fit(self, history: History) -> Model:
         """The network on the history."""
         return Model(lambda ahead: learned(history, ahead, self))
@@ -321,7 +316,7 @@ def learned(history: History, ahead: np.ndarray, options: GraphForecast = GraphF
         f"the network was trained on horizons of up to {LONGEST:g} windows, but {ahead[-1] - known[-1]:.4g} s are "
         f"asked for after a window of {length:.4g} s; ask for fewer --times, or take --by paths.",
     )
-    trained = options.trained
+    trained = read_dynamics(Path(options.weights)) if options.weights else read_dynamics()
     places = places_of(bodies, known)
     horizon = torch.from_numpy(np.r_[0.0, (ahead - known[-1]) / length])
     faces = [bodies.body(k)[1].numpy() for k in range(bodies.count)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -20,7 +21,7 @@ from ..motion.assimilate import carry_by_frames
 from ..motion.dynamics import DynamicsForecast, HybridForecast, window_of
 from ..motion.fit import MotionFit
 from ..motion.forecast import Forecast, Forecaster, Halves, History, PathForecast, decided
-from ..motion.learned import GraphForecast
+from ..motion.learned import GraphForecast, read_dynamics
 from ..motion.measures import LEAST, half_sets
 from ..motion.modes import DmdForecast, SindyForecast
 from ..optics.background import Light
@@ -127,8 +128,8 @@ def tracked_bodies(run: Reconstruction) -> MovingSurfaces:
 def require_cells(run: Reconstruction, times: np.ndarray, options: ForecastOptions) -> None:
     """`InputError`, before any fit, where mechanics have no cell to carry on after the tracked `times` [T] s, and where
     what was learnt cannot be asked, or is no network; `MissingError` without its library."""
-    if isinstance(options.learned, GraphForecast):
-        _ = options.learned.trained
+    if isinstance(options.learned, GraphForecast) and options.learned.weights:
+        read_dynamics(Path(options.learned.weights))
     if options.dynamics is not None:
         window_of(tracked_bodies(run), times, options.ahead(times), options.dynamics)
     if options.learned is not None and not options.decides:
