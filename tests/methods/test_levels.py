@@ -222,9 +222,11 @@ def test_absorption_is_taken_where_it_predicts_unseen_views(kind, true, likelies
     sharp = MeshScene.of_one_material(random_cells(4, size, 5, 17e-6), material)
     task = Task(measured(cells if kind == "soft" else sharp), MaterialPrior.unknown(1))
     place = import_module("holosplat.methods.levels")
-    monkeypatch.setattr(place, "likeliest_ratio", lambda task: likely(likeliest))
+    asked = list[Task]()
+    monkeypatch.setattr(place, "likeliest_ratio", lambda task: asked.append(task) or likely(likeliest))
     there, (decision,) = decide_ratio(task, first_of_task(task))
     found = ratio_of_one(task, there)
+    assert len(asked) == 1
     assert (decision.name, decision.by) == ("δ/β in frames as measured", "views set aside")
     assert found.value == (likeliest if true == likeliest else LIKELY_RATIOS[1])
     assert there.material.ratio == pytest.approx(found.value)

@@ -117,18 +117,20 @@ def test_two_constants_that_frames_tell_are_both_found():
     assert distance.low < 0.12 < distance.high < 0.14
 
 
-@pytest.mark.parametrize(("noise_share", "most"), [(0.0, 20), (0.25, 12)])
-def test_a_search_is_no_finer_than_its_systematic_error(noise_share, most):
+@pytest.mark.parametrize(("noise_share", "most", "right"), [(0.0, 21, 0.01), (0.25, 16, 0.1)])
+def test_a_search_is_as_fine_as_its_systematic_error_and_no_finer(noise_share, most, right):
+    """Of a valley that is steeper on one side: by one step of Newton's, the value is off by 0.036."""
     asked = list[float]()
 
     def valley(constants):
         asked.append(constants["delta_beta"])
-        return 3000 * math.log(constants["delta_beta"] / 1350.0) ** 2
+        x = 2 * math.log(constants["delta_beta"] / 700.0)
+        return 750 * (math.exp(x) - x - 1)
 
     valley.noise_share = noise_share
     ranges = {"delta_beta": (60.0, 20_000.0)}
     (found,) = Search(valley, ranges, Task(blob_scan(count=2), MaterialPrior.unknown())).run()
-    assert found.value == pytest.approx(1350.0, rel=0.05)
+    assert found.value == pytest.approx(700.0, rel=right)
     assert len(asked) <= most
 
 
