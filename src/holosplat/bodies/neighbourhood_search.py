@@ -20,8 +20,6 @@ LEAST, ALSO = 0.35, 0.8
 others are taken in the same round."""
 TRIED, FIRST_STEPS, STEPS, LAST_STEPS = 4, 8, 5, 15
 """Places that are tried in a round, and steps of the search for better poses: of one, of all, of all in the end."""
-SURE = 0.8
-"""Share from which on a body is hardly one that stands for others."""
 SAME_HEIGHT = 1.0
 """Radii within which bodies that two beams might exchange are at one height."""
 MOST_PURSUED = 60
@@ -30,7 +28,7 @@ MOST_PURSUED = 60
 def searched(every: Explained, search: TemplateSearch, begun: list[Pose]) -> list[Pose]:
     """`begun` and what is found beside them, without those that explain nothing."""
     found = _add_bodies(every, search, explaining(every, begun))
-    return explaining(every, exchanged(every, search, every.improved(found, LAST_STEPS)))
+    return explaining(every, every.improved(found, LAST_STEPS))
 
 
 def explaining(every: Explained, found: Sequence[Pose]) -> list[Pose]:
@@ -70,23 +68,22 @@ def _pose_of(hit: Hit) -> Pose:
 
 
 def exchanged(every: Explained, search: TemplateSearch, found: list[Pose]) -> list[Pose]:
-    """The same bodies, pairs of which have exchanged what two beams show of them where that explains more.
+    """The same bodies, pairs of which have exchanged what two beams show of them, until no exchange is clearly better.
 
     Two beams see two bodies at one height as they would see two others, each in the shadow of the one in the first
-    beam and of the other in the second. Their shapes and motion tell which they are; pairs that explain enough (`SURE`)
-    are left as they are.
+    beam and of the other in the second. Their shapes and motion tell which they are, and small steps do not lead from
+    these to those. Pairs are few, so that all are tried; they are compared when all bodies have made room for them.
     """
-    if not two_beams(search):
-        return found
-    found, sure = list(found), every.shares(found) >= SURE
-    for i, j in level_pairs(every, found):
-        if sure[i] and sure[j]:
-            continue
-        left = every.without([pose for k, pose in enumerate(found) if k not in (i, j)])
-        others = swapped(every, search, found, i, j)
-        if left.value(others) < left.value([found[i], found[j]]):
-            found[i], found[j] = others
-    return every.improved(found, STEPS)
+    least, before = every.value(found), np.inf
+    while two_beams(search) and least < (1 - CLEARLY) * before:
+        before = least
+        for i, j in level_pairs(every, found):
+            other = list(found)
+            other[i], other[j] = swapped(every, search, found, i, j)
+            other = every.improved(other, LAST_STEPS)
+            if (value := every.value(other)) < least:
+                found, least = other, value
+    return found
 
 
 def two_beams(search: TemplateSearch) -> bool:
@@ -159,23 +156,22 @@ def best_choice(products: np.ndarray, gains: np.ndarray) -> np.ndarray:
     From nothing, and from each candidate alone, the best change is made again and again: one is put in, left out, or
     put in for another, until no such change is better (iterative improvement: Aarts & Lenstra 1997, chapter 1).
     """
-    count, found = len(gains), list[tuple[float, np.ndarray]]()
-    for first in range(-1, count):
-        x = np.arange(count) == first
-        found.append(_improved(products, gains, x))
-    return min(found, key=lambda pair: pair[0])[1]
+    known = set[bytes]()
+    ways = [_improved(products, gains, np.arange(len(gains)) == first, known) for first in range(-1, len(gains))]
+    return min(ways, key=lambda pair: pair[0])[1]
 
 
-def _improved(products: np.ndarray, gains: np.ndarray, x: np.ndarray) -> tuple[float, np.ndarray]:
-    """The value of the choice that single changes lead to from `x` [C], and that choice.
+def _improved(products: np.ndarray, gains: np.ndarray, x: np.ndarray, known: set[bytes]) -> tuple[float, np.ndarray]:
+    """The value of the choice that single changes lead to from `x` [C], and that choice; or of the first one from which
+    an earlier way went on, for all that were passed are `known`.
 
     A change by less than rounding is none: equal candidates would be put in for each other for ever.
     """
-    own = 0.5 * np.diag(products)
+    own, slope = 0.5 * np.diag(products), products @ x - gains
     largest = max(float(np.abs(products).max(initial=0.0)), float(np.abs(gains).max(initial=0.0)))
     rounding = 4 * len(gains) * np.finfo(float).eps * largest
-    while True:
-        slope = products @ x - gains
+    while x.tobytes() not in known:
+        known.add(x.tobytes())
         flips, inside, outside = np.where(x, own - slope, own + slope), np.flatnonzero(x), np.flatnonzero(~x)
         flip = int(flips.argmin())
         change, gone = float(flips[flip]), [flip]
@@ -185,9 +181,11 @@ def _improved(products: np.ndarray, gains: np.ndarray, x: np.ndarray) -> tuple[f
             if swaps[out, into] < change:
                 change, gone = float(swaps[out, into]), [int(inside[out]), int(outside[into])]
         if change >= -rounding:
-            return float(0.5 * x @ products @ x - gains @ x), x
+            break
         x = x.copy()
         x[gone] = ~x[gone]
+        slope = slope + np.where(x[gone], 1, -1) @ products[gone]
+    return float(0.5 * x @ (slope - gains)), x
 
 
 TRIES, MOST_ROUNDS, PATIENCE = 12, 20, 3
@@ -202,8 +200,6 @@ LOOKED_AT, CHOICE = 6, 0.1
 """Places that are looked at for a body in place of another, and the difference of shares that matters between them."""
 MOST_OTHERS = 3
 """Bodies that are taken away beside the first."""
-EXCHANGES = 4
-"""Every so many-th try exchanges what two beams show of a pair."""
 FREE_STEPS = 80
 """Steps to better poses in the end."""
 
@@ -230,6 +226,7 @@ def pursued(
     free = Explained(mesh, seen, FREER, run)
     starts = [[], every.improved(begun, LAST_STEPS)] if begun else [[]]
     found = [free.improved(searched(every, search, start), LAST_STEPS) for start in starts]
+    found = [exchanged(free, search, poses) for poses in found]
     best = int(np.argmin([free.value(poses) for poses in found]))
     tried = [pose for poses in found for pose in poses]
     better = NeighbourhoodSearch(free, search, seed).better(found[best], tried, on_progress)
@@ -250,7 +247,6 @@ class NeighbourhoodSearch:
 
     def __post_init__(self) -> None:
         self._draws, self._pool = np.random.default_rng(self.seed), Pool(self.every)
-        self._two = two_beams(self.search)
 
     def better(
         self, found: list[Pose], tried: Sequence[Pose] = (), on_progress: Heard = lambda share: None
@@ -261,7 +257,7 @@ class NeighbourhoodSearch:
 
         Slightly worse states are accepted, too (record-to-record travel: Dueck 1993, J. Comput. Phys.
         104, 86): of bodies that stand for each other's shadows all must change before anything is better. Each round
-        ends with the best choice among all bodies that were tried so far.
+        ends with the best choice among all bodies that were tried so far, and with exchanges (`exchanged`).
         """
         best, least, idle = found, self.every.value(found), 0
         self._pool.add([*found, *tried])
@@ -270,20 +266,23 @@ class NeighbourhoodSearch:
             for number in range(tries):
                 part = number / tries
                 on_progress(max((turn + part) / MOST_ROUNDS, (idle + part) / PATIENCE))
-                other = self._best_choice() if number == tries - 1 else self._perturb(now, number)
+                other = self._best_choice() if number == tries - 1 else self._perturb(now)
                 value = self.every.value(other)
                 now = other if other and value < (1 + WORSE) * least else now
                 if value < least:
                     best, least = other, value
+            if least < before:
+                best = exchanged(self.every, self.search, best)
+                least = self.every.value(best)
+                self._pool.add(best)
             idle = 0 if least < (1 - CLEARLY) * before else idle + 1
             if idle == PATIENCE:
                 break
         return explaining(self.every, best)
 
-    def _perturb(self, found: list[Pose], number: int) -> list[Pose]:
+    def _perturb(self, found: list[Pose]) -> list[Pose]:
         """Another choice, made better."""
-        other = self._exchange(found) if self._two and number % EXCHANGES == 0 else self._replace(found)
-        other = self.every.improved(other, LAST_STEPS)
+        other = self.every.improved(self._replace(found), LAST_STEPS)
         self._pool.add(other)
         return other
 
@@ -325,12 +324,3 @@ class NeighbourhoodSearch:
         """Draw one of the bodies that were tried, more likely one that explains more."""
         likely = np.exp([(share - tried[0][0]) / CHOICE for share, _ in tried])
         return tried[int(self._draws.choice(len(tried), p=likely / likely.sum()))][1]
-
-    def _exchange(self, found: list[Pose]) -> list[Pose]:
-        """The same bodies, two of one height, if there are such, as if each had the other's shadow in one beam."""
-        pairs = level_pairs(self.every, found)
-        if not pairs:
-            return found
-        i, j = pairs[int(self._draws.integers(len(pairs)))]
-        others = swapped(self.every, self.search, found, i, j)
-        return [*(pose for k, pose in enumerate(found) if k not in (i, j)), *others]
