@@ -81,9 +81,9 @@ def once(memory: Once) -> Iterator[None]:
         key = ("light", *of(first.folds.scan), first.prior, *how)
         return memory.answer(key, lambda told: decided(replace(first, on_progress=told), *how), first.on_progress)
 
-    def sign(first: FirstVolumes, *scores: Scoring) -> Any:
+    def sign(first: FirstVolumes, *scores: Scoring, fitted: Scoring) -> Any:
         def compute(told: Progress) -> tuple[Decision, ...]:
-            return decide_sign(replace(first, on_progress=told), *scores)[1]
+            return decide_sign(replace(first, on_progress=told), *scores, fitted=fitted)[1]
 
         made = memory.answer(("sign", *of(first.folds.scan), first.prior), compute, first.on_progress)
         above = not any(each.choice == BELOW for each in made)

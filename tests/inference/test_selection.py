@@ -133,6 +133,21 @@ def test_a_gain_that_another_score_has_shown_needs_practical_size_only():
     assert select("light", ("null", "alike"), score, **asked).choice == "null"
 
 
+def test_a_gain_whose_size_another_score_has_shown_needs_to_be_sure_only():
+    score = residuals({"null": (1.0, 1.0), "other": (0.99, 0.99), "worse": (1.01, 1.01)})
+    asked = {"by": "data fission", "least": 0.0}
+    assert select("bodies", ("null", "other"), score, 2, by="views").choice == "null"
+    found = select("bodies", ("null", "other"), score, 2, **asked)
+    assert found.choice == "other"
+    assert Decision.from_dict(found.as_dict()) == found
+    assert select("bodies", ("null", "worse"), score, 2, **asked).choice == "null"
+
+
+def test_after_a_rival_that_wins_no_other_is_asked_for():
+    score = residuals({"null": (1.0,), "other": (1.2,)})
+    assert select("name", ["null", "other"], score, by="x", beside={"other": ("never made",)}).choice == "null"
+
+
 def test_rivals_beside_the_null_must_be_beaten_too():
     score = residuals({"null": (1.0,), "free": (0.5,), "other": (0.7,)})
     assert select("name", ["null", "other"], score, by="x").choice == "other"

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
@@ -14,6 +17,7 @@ from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import METHODS, PerView, Task
 from holosplat.methods.contrast import ABOVE, BELOW, decide_sign
 from holosplat.methods.contrast import STAGE as SIGN
+from holosplat.methods.cross_validation import BY_FISSION
 from holosplat.methods.illumination import prepared
 from holosplat.methods.method import first_of_task
 from holosplat.metrics import volume_scores
@@ -76,7 +80,11 @@ def test_bodies_stay_bodies(cells):
 def test_what_is_told_is_not_asked(holes):
     told = Task(holes.train(), MaterialPrior.known(AIR_IN_WATER))
     first = first_of_task(told)
-    assert decide_sign(first, lambda volumes, fold: pytest.fail("a score was asked for")) == (first, ())
+
+    def asked(volumes, fold, without):
+        pytest.fail("a score was asked for")
+
+    assert decide_sign(first, asked, fitted=asked) == (first, ())
 
 
 def test_a_volume_worse_than_none_does_not_tell_the_sign(cells):
@@ -88,7 +96,31 @@ def test_a_volume_worse_than_none_does_not_tell_the_sign(cells):
         left = torch.from_numpy(unseen.frames).double() - 1
         return Score.of(left * (3.0 if volumes is first and not without else 1.0))
 
-    assert decide_sign(first, score)[1][0].choice == ABOVE
+    assert decide_sign(first, score, fitted=score)[1][0].choice == ABOVE
+
+
+@pytest.mark.parametrize(
+    ("unseen", "fitted", "choice"),
+    [
+        ((1.0, 1.0), (0.5, 0.9), BELOW),  # unseen views leave it open
+        ((1.5, 1.0), (0.5, 0.9), ABOVE),  # holes predict less than no matter
+        ((1.0, 1.0), (0.9, 0.5), ABOVE),
+        ((1.0, 1.0), (1.0, 1.5), ABOVE),  # neither is matter
+    ],
+)
+def test_where_unseen_views_leave_the_sign_open_fitted_ones_compare_it(cells, unseen, fitted, choice):
+    """What is left by holes and by bodies, over what is left without matter."""
+    first = first_of_task(Task(cells.train(), MaterialPrior.of_ratio(1500)))
+
+    def score(left: tuple[float, float], volumes, fold: int, without: str) -> Score:
+        frames = torch.from_numpy(first.folds.split(fold)[1].frames).double() - 1
+        return Score.of(frames * (1.0 if without else left[volumes is first]))
+
+    found, decisions = decide_sign(first, partial(score, unseen), fitted=partial(score, fitted))
+    assert decisions[0].choice == choice
+    assert found.prior.sign == (-1 if choice == BELOW else 0)
+    halves = replace(first, folds=replace(first.folds, count=1, by=BY_FISSION))
+    assert decide_sign(halves, partial(score, unseen), fitted=partial(score, fitted))[1][0].choice == ABOVE
 
 
 @pytest.mark.parametrize("name", ["tikhonov-tv", "ctf-tv", "holographic-tv"])

@@ -317,12 +317,12 @@ def test_where_no_body_keeps_a_voxel_there_are_none(noisy, monkeypatch):
     assert with_missing_bodies(noisy, mesh_of(3), HOW, OPTIONS.coarse) is None
 
 
-def test_two_views_are_judged_by_data_fission(noisy, monkeypatch):
-    """Both halves of their noise are of all views: one is fitted, and the other predicted."""
+@pytest.mark.parametrize("views", [[0, 4], [0, 1, 3, 4, 6]])
+def test_few_views_are_judged_by_data_fission(noisy, views, monkeypatch):
     monkeypatch.setattr("holosplat.methods.surfaces.begun_surfaces", lambda *given: None)
     monkeypatch.setattr("holosplat.methods.surfaces.with_missing_bodies", lambda *given: (0.2, mesh_of(4)))
     told = list[Decision]()
-    task = replace(noisy.of_views(np.array([0, 4])), on_start=lambda decision, guess: told.append(decision))
+    task = replace(noisy.of_views(np.array(views)), on_start=lambda decision, guess: told.append(decision))
     found, _ = best_cut(task, 2)
     assert (told[-1].name, told[-1].choice, told[-1].by) == (BODIES, MORE, BY_FISSION)
     assert torch.equal(found.vertices, mesh_of(4).vertices)

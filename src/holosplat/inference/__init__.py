@@ -1,5 +1,5 @@
 """How the program chooses between hypotheses: one score of unseen frames, and one policy."""
 
-from .selection import ERRORS, MARGIN, Compared, Decision, Score, select
+from .selection import ERRORS, LEAST, MARGIN, Compared, Decision, Score, select
 
-__all__ = ["ERRORS", "MARGIN", "Compared", "Decision", "Score", "select"]
+__all__ = ["ERRORS", "LEAST", "MARGIN", "Compared", "Decision", "Score", "select"]

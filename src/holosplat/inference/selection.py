@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -109,11 +109,12 @@ LEAST = -math.log1p(-MARGIN)
 @dataclass(frozen=True)
 class Compared:
     """A candidate beside the best one before it: by how much its residual is smaller (the logarithm of the ratio), and
-    the standard error of that."""
+    the standard error of that; least: the gain that has practical size."""
 
     name: str
     gain: float
     error: float
+    least: float = LEAST
 
     @property
     def wins(self) -> bool:
@@ -133,16 +134,16 @@ class Compared:
     @property
     def open(self) -> bool:
         """Whether the gain may yet be of practical size, as far as its error tells."""
-        return self.gain + ERRORS * self.error > LEAST
+        return self.gain + ERRORS * self.error > self.least
 
     @property
     def large(self) -> bool:
         """Whether the gain is of practical size, sure or not."""
-        return self.gain > LEAST
+        return self.gain > self.least
 
     @property
     def _sure(self) -> float:
-        return max(ERRORS * self.error, LEAST)
+        return max(ERRORS * self.error, self.least)
 
 
 @dataclass(frozen=True)
@@ -158,7 +159,7 @@ class Decision:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, which `from_dict` takes."""
-        compared = [{"name": each.name, "gain": each.gain, "error": each.error} for each in self.compared]
+        compared = [asdict(each) for each in self.compared]
         return {
             "name": self.name,
             "choice": self.choice,
@@ -171,7 +172,8 @@ class Decision:
     def from_dict(cls, table: Mapping[str, Any]) -> Decision:
         """The decision that `as_dict` wrote."""
         compared = tuple(
-            Compared(str(each["name"]), float(each["gain"]), float(each["error"])) for each in table["compared"]
+            Compared(str(each["name"]), float(each["gain"]), float(each["error"]), float(each.get("least", LEAST)))
+            for each in table["compared"]
         )
         return cls(str(table["name"]), str(table["choice"]), str(table["by"]), compared, float(table["seconds"]))
 
@@ -191,6 +193,7 @@ def select(
     by: str,
     beside: Mapping[str, Sequence[str]] | None = None,
     surely: bool = True,
+    least: float = LEAST,
 ) -> Decision:
     """The candidate that predicts unseen frames best, by the policy of `Compared.wins`.
 
@@ -198,29 +201,36 @@ def select(
     by the caller; folds: how many there are. Folds are looked at one after another, as long as the candidate may win by
     those before; it is taken only if it wins over all of them, where the frames, and not their blocks, give the
     standard error: frames differ by more than their parts do. by: how unseen frames came about; beside: other names
-    that a candidate must win against, too. surely: whether a gain must be sure; where another score has told that, its
-    size is enough.
+    that a candidate must win against, too. surely, least: whether a gain must be sure, and the practical size that it
+    must have. Where another score has told that it is sure, its size is enough; where another has told its size
+    (`least` is 0), it need only be sure.
     """
     require(len(candidates) > 0, "a selection needs at least one candidate, but there is none.")
     began, best, compared = time.perf_counter(), candidates[0], list[Compared]()
     for candidate in candidates[1:]:
         rivals = (best, *(beside or {}).get(candidate, ()))
-        found = _least(candidate, rivals, score, range(1))
+        found = _weakest(candidate, rivals, score, range(1), least)
         for last in range(1, folds):
             if found.open:
-                found = _least(candidate, rivals, score, range(last + 1))
+                found = _weakest(candidate, rivals, score, range(last + 1), least)
         compared.append(found)
         if found.wins or (found.large and not surely):
             best = candidate
     return Decision(name, best, by, tuple(compared), round(time.perf_counter() - began, 2))
 
 
-def _least(candidate: str, rivals: Sequence[str], score: Callable[[str, int], Score], folds: range) -> Compared:
-    """The comparison with the strongest of the rivals, over some folds."""
+def _weakest(
+    candidate: str, rivals: Sequence[str], score: Callable[[str, int], Score], folds: range, least: float
+) -> Compared:
+    """The comparison with the strongest of the rivals, over some folds; or with the first that it cannot win against,
+    after which no other need be made."""
 
     def joined(name: str) -> Score:
         return Score.joined([score(name, fold) for fold in folds])
 
-    mine = joined(candidate)
-    found = [Compared(candidate, *mine.gain_over(joined(rival))) for rival in rivals]
+    mine, found = joined(candidate), list[Compared]()
+    for rival in rivals:
+        found.append(Compared(candidate, *mine.gain_over(joined(rival)), least))
+        if not found[-1].open:
+            return found[-1]
     return min(found, key=lambda each: each.gain - ERRORS * each.error)

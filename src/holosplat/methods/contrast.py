@@ -24,6 +24,7 @@ from .trials import WITHOUT, Hypothesis, Trials, name_of
 STAGE = "sign of the contrast"
 ABOVE, BELOW = "δ above the medium's", "δ below the medium's"
 BOTH = "δ on both sides of the medium's"
+BY_FITTED = "frames of the fits"
 SPHERICAL, BALL = f"spherical matter, {BOTH}", "spherical matter on one side of the medium"
 
 
@@ -31,12 +32,15 @@ Scoring = Callable[[FirstVolumes, int, str], Score]
 """Of first volumes, on the unseen frames of a fold; `WITHOUT` their matter, or with it ("")."""
 
 
-def decide_sign(first: FirstVolumes, *scores: Scoring) -> tuple[FirstVolumes, tuple[Decision, ...]]:
+def decide_sign(first: FirstVolumes, *scores: Scoring, fitted: Scoring) -> tuple[FirstVolumes, tuple[Decision, ...]]:
     """The first volumes of the sign that unseen frames speak for, and the decision; none where the sign is known.
 
     scores: in even light, and then in such light as may have hidden the sign: each is asked where those before it have
-    left the sign open. A sign under which no matter is found predicts even light, and a sign is sure only where its
-    matter predicts frames better than none.
+    left the sign open; fitted: on the frames that a fold's volume was made of, in even light. A sign under which no
+    matter is found predicts even light, and a sign is sure only where its matter predicts frames better than none. Some
+    matter shows itself in few views, as walls along the beam do, and the others predict it under neither sign. Volumes
+    of both signs have as many unknowns, so that views that they were fitted to compare them, too: holes are then taken
+    that explain these better than matter above its medium and than none, and that predict no less than none.
     """
     if first.prior.sign or first.prior.two_sided:
         return first, ()
@@ -44,21 +48,25 @@ def decide_sign(first: FirstVolumes, *scores: Scoring) -> tuple[FirstVolumes, tu
     holes = FirstVolumes(first.folds, first.prior.signed(-1), first.on_progress, first.options)
     volumes = {ABOVE: first, BELOW: holes}
 
-    def asked(score: Scoring, null: str, other: str) -> Decision:
+    def asked(score: Scoring, null: str, other: str, by: str = first.folds.by, surely: bool = True) -> Decision:
         def scored(name: str, fold: int) -> Score:
             sign, without, _ = name.partition(WITHOUT)
             try:
                 return score(volumes[sign], fold, without)
             except InputError:  # there is no such matter, or no such light
-                return without_matter(first, fold)
+                return without_matter(first, fold, by == BY_FITTED)
 
-        beside = {other: (other + WITHOUT,)}
-        return select(STAGE, (null, other), scored, first.folds.count, by=first.folds.by, beside=beside)
+        beside = {} if WITHOUT in other else {other: (other + WITHOUT,)}
+        return select(STAGE, (null, other), scored, first.folds.count, by=by, beside=beside, surely=surely)
 
     for score in scores:
         decision = asked(score, ABOVE, BELOW)
         if decision.choice == BELOW or asked(score, BELOW, ABOVE).choice == ABOVE:
-            break
+            return volumes[decision.choice], (decision,)
+    if first.folds.by != BY_FISSION:  # its halves are of the same views
+        seen = asked(fitted, ABOVE, BELOW, BY_FITTED)
+        if seen.choice == BELOW and asked(scores[0], BELOW, BELOW + WITHOUT, surely=False).choice == BELOW:
+            decision = seen
     return volumes[decision.choice], (decision,)
 
 
@@ -129,10 +137,11 @@ def both_sides(first: FirstVolumes) -> FirstVolumes:
     return FirstVolumes(first.folds, first.prior.on_both_sides(), first.on_progress, how)
 
 
-def without_matter(first: FirstVolumes, fold: int) -> Score:
-    """The score of even light in a fold."""
-    unseen = first.folds.split(fold)[1]
-    return Score.of(unseen.left(torch.ones(unseen.frames.shape, dtype=torch.float64)))
+def without_matter(first: FirstVolumes, fold: int, fitted: bool = False) -> Score:
+    """The score of even light on the unseen frames of a fold, or on the fitted ones."""
+    seen, unseen = first.folds.split(fold)
+    scan = seen if fitted else unseen
+    return Score.of(scan.left(torch.ones(scan.frames.shape, dtype=torch.float64)))
 
 
 def with_sign(prior: MaterialPrior, decisions: Sequence[Decision]) -> MaterialPrior:

@@ -153,10 +153,11 @@ class Folds:
     """(H, W) of the frames before binning; None: as these."""
 
     @classmethod
-    def of(cls, train: Scan, binning: int | None = None) -> Folds:
-        """Of training frames of one time. binning: of pixels along an edge; None: as many as leave coarse frames."""
+    def of(cls, train: Scan, binning: int | None = None, fewest: int = FEWEST) -> Folds:
+        """Of training frames of one time. binning: of pixels along an edge; None: as many as leave coarse frames;
+        fewest: views from which on some are set aside."""
         binning, views = binning or coarse_binning(train), len(train)
-        by, most = (BY_FISSION, 1) if views < FEWEST else (BY_VIEWS, MOST if views >= MANY else views)
+        by, most = (BY_FISSION, 1) if views < fewest else (BY_VIEWS, MOST if views >= MANY else views)
         return cls(train.binned(binning), most, by, binning, train.views.shape)
 
     def aside(self, fold: int) -> np.ndarray:

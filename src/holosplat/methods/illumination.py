@@ -130,7 +130,7 @@ def prepared(task: Task, method: Method | None = None, before: Prepared | None =
         )
     first = first_of_task(task, _volume_of(method).backend)
     if before is None:
-        first, signs = decide_sign(first, *_scores(task.light))
+        first, signs = decide_sign(first, *_scores(task.light), fitted=partial(_fitted, task.light))
     else:
         signs = tuple(each for each in before[1] if each.name == SIGN)
     task = replace(task, prior=with_sign(task.prior, signs), decisions=(*task.decisions, *signs))
@@ -201,6 +201,12 @@ def _scores(options: LightOptions) -> list[Scoring]:
         return trials.score(name_of(hypothesis) + without, fold)
 
     return [partial(under, one) for one in ((), (UNEVEN,)) if not one or options.kind != "even"]
+
+
+def _fitted(options: LightOptions, volumes: FirstVolumes, fold: int, without: str) -> Score:
+    """The score of a volume, or of none, on the frames that it was made of, as they were measured."""
+    trial = Trials(volumes, options).tried((), fold)
+    return Score.of(trial.seen.left(torch.ones_like(trial.predicted) if without else trial.predicted))
 
 
 def _applied(task: Task, light: Light, taken: Hypothesis) -> tuple[Scan, Light]:

@@ -10,13 +10,13 @@ from typing import ClassVar
 
 from ..checks import InputError, require
 from ..fit.loop import Fit
-from ..inference import Score, select
+from ..inference import LEAST, Score, select
 from ..matter import MaterialPrior
 from ..progress import Progress
 from ..representations import GaussianCloud, Stored, SurfaceMesh
 from ..scan import Scan
 from .coarse import CoarseToFine, Way, begun_surfaces, coarse_surfaces, missing_matter, on_pixels, settled
-from .cross_validation import Folds
+from .cross_validation import BY_FISSION, MANY, Folds
 from .first_surfaces import first_surfaces, is_noisy, surfaces_of_volume, with_missing_bodies
 from .gaussians import Gaussians, GaussianStage
 from .keeper import BY
@@ -140,7 +140,9 @@ class BodiesStage(GaussianStage):
         them, and then more of views that are set aside; else None.
 
         Training frames alone may prefer bodies that make up for noise. In each fold both begin with `found`, which has
-        seen all views, and bodies are sought in the others alone.
+        seen all views, and bodies are sought in the others alone. Of few views each shows what the others do not, so
+        that fewer find other bodies: noise is split (`Folds`), and as its halves have more of it than the frames, of
+        which they have told how much is explained, the gain need only be sure.
         """
         joined = with_missing_bodies(task, found, self.surfaces, steps)
         if joined is None:
@@ -148,7 +150,7 @@ class BodiesStage(GaussianStage):
         (level, more), own = joined, settled(task, found, self.surfaces, steps)
         if self._chosen(BODIES, {AS_FOUND: own, MORE: more}, task) is own:
             return None
-        folds = Folds.of(task.scan, binning=1)
+        folds = Folds.of(task.scan, binning=1, fewest=MANY)
 
         @cache
         def scores(fold: int) -> dict[str, Score]:
@@ -159,7 +161,9 @@ class BodiesStage(GaussianStage):
             both = {AS_FOUND: null, MORE: other}
             return {name: self._score(each, replace(task, scan=unseen)) for name, each in both.items()}
 
-        decision = select(BODIES, (AS_FOUND, MORE), lambda name, fold: scores(fold)[name], folds.count, by=folds.by)
+        least = 0.0 if folds.by == BY_FISSION else LEAST
+        both = (AS_FOUND, MORE), lambda name, fold: scores(fold)[name], folds.count
+        decision = select(BODIES, *both, by=folds.by, least=least)
         task.on_start(decision, None)
         return more if decision.choice == MORE else None
 
