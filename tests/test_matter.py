@@ -64,6 +64,9 @@ def test_what_cannot_be_seen_or_told_apart_is_refused():
         MaterialPrior.known(DeltaBeta(-1e-7, 0.0), DeltaBeta(-1e-7, -1e-9))
     with pytest.raises(InputError, match="sign must be -1, 0 or 1"):
         prior_of(MaterialPrior.unknown().as_dict() | {"sign": 2})
+    assert MaterialPrior.of_ratio(1e6).ratio == 1e6
+    with pytest.raises(InputError, match=r"size between 1 and 1e\+06, but it is 1\.1e\+06"):
+        MaterialPrior.of_ratio(1.1e6)
 
 
 def test_only_where_nothing_is_known_is_the_ratio_open():

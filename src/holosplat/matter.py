@@ -340,7 +340,7 @@ class KnownRatio(MaterialPrior):
     def __post_init__(self) -> None:
         low, high = RATIO_RANGE
         require(
-            low <= abs(self.ratio) < high,
+            low <= abs(self.ratio) <= high,
             f"delta_beta must have a size between {low:g} and {high:g}, but it is {self.ratio:g}.",
         )
 
