@@ -24,7 +24,7 @@ from .trials import WITHOUT, Hypothesis, Trials, name_of
 STAGE = "sign of the contrast"
 ABOVE, BELOW = "δ above the medium's", "δ below the medium's"
 BOTH = "δ on both sides of the medium's"
-BY_FITTED = "frames of the fits"
+BY_FITTED = "fitted frames"
 SPHERICAL, BALL = f"spherical matter, {BOTH}", "spherical matter on one side of the medium"
 
 
@@ -40,7 +40,7 @@ def decide_sign(first: FirstVolumes, *scores: Scoring, fitted: Scoring) -> tuple
     matter is found predicts even light, and a sign is sure only where its matter predicts frames better than none. Some
     matter shows itself in few views, as walls along the beam do, and the others predict it under neither sign. Volumes
     of both signs have as many unknowns, so that views that they were fitted to compare them, too: holes are then taken
-    that explain these better than matter above its medium and than none, and that predict no less than none.
+    that explain these better than matter above its medium and than none, and predict unseen ones no worse than none.
     """
     if first.prior.sign or first.prior.two_sided:
         return first, ()
