@@ -13,16 +13,20 @@ import holosplat as hs
 from holosplat.beamline.simulate import simulate
 from holosplat.geometry import Grid, Views
 from holosplat.inference import Score
+from holosplat.materials import parse_material
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import METHODS, PerView, Task
-from holosplat.methods.contrast import ABOVE, BELOW, decide_sign
+from holosplat.methods.contrast import ABOVE, BELOW, BY_FITTED, decide_sign, without_matter
 from holosplat.methods.contrast import STAGE as SIGN
 from holosplat.methods.cross_validation import BY_FISSION
-from holosplat.methods.illumination import prepared
+from holosplat.methods.illumination import _fitted, _scores, prepared
 from holosplat.methods.method import first_of_task
+from holosplat.methods.trials import WITHOUT
 from holosplat.metrics import volume_scores
+from holosplat.optics.background import LightOptions
 from holosplat.scan import Exposures, Scan
-from holosplat.specimens import MeshScene, RodScene, random_bubbles
+from holosplat.specimens import MeshScene, RodScene, Substances, random_bubbles
+from holosplat.specimens.matter import MATTER
 from holosplat.specimens.red_cells import random_cells
 from holosplat.workflows.preconditions import decisions_of
 from holosplat.workflows.totals import TotalMatter
@@ -114,13 +118,38 @@ def test_where_unseen_views_leave_the_sign_open_fitted_ones_compare_it(cells, un
 
     def score(left: tuple[float, float], volumes, fold: int, without: str) -> Score:
         frames = torch.from_numpy(first.folds.split(fold)[1].frames).double() - 1
-        return Score.of(frames * (1.0 if without else left[volumes is first]))
+        return Score.of(frames * (1.0 if without else left[volumes.prior.sign == 0]))
 
     found, decisions = decide_sign(first, partial(score, unseen), fitted=partial(score, fitted))
     assert decisions[0].choice == choice
     assert found.prior.sign == (-1 if choice == BELOW else 0)
     halves = replace(first, folds=replace(first.folds, count=1, by=BY_FISSION))
     assert decide_sign(halves, partial(score, unseen), fitted=partial(score, fitted))[1][0].choice == ABOVE
+
+
+def test_fitted_frames_are_those_that_volumes_were_made_of(cells):
+    first = first_of_task(Task(cells.train(), MaterialPrior.of_ratio(1500)))
+    kept, aside = len(first.folds.kept(0)), len(first.folds.aside(0))
+    assert kept != aside
+    assert (without_matter(first, 0).frames, without_matter(first, 0, fitted=True).frames) == (aside, kept)
+    none = _fitted(LightOptions(), first, 0, WITHOUT)
+    assert np.allclose(none.powers, without_matter(first, 0, fitted=True).powers)
+    assert _fitted(LightOptions(), first, 0, "").gain_over(none)[0] > 0.5
+
+
+def test_a_crack_is_a_hole_that_fitted_frames_tell():
+    """Of a thin crack through the field, which views along it show."""
+    kind = MATTER["crack"](64e-6)
+    air, medium = (parse_material(name).delta_beta(20.0) for name in (kind.named[0], kind.named[2]))
+    drawn = kind.drawn(Substances(air, None, medium), 1)
+    views = Views.evenly_spaced(8, shape=(64, 64), pixel_size=PIXEL)
+    scan = simulate(
+        drawn.scene, Exposures.of(views, 20.0, 0.1), photons_per_pixel=3000.0, seed=1, is_test=np.zeros(8, bool)
+    )
+    task = Task(scan, MaterialPrior.unknown())
+    how = {"fitted": partial(_fitted, task.light)}
+    _, (decision,) = decide_sign(first_of_task(task), *_scores(task.light), **how)
+    assert (decision.choice, decision.by) == (BELOW, BY_FITTED)
 
 
 @pytest.mark.parametrize("name", ["tikhonov-tv", "ctf-tv", "holographic-tv"])

@@ -324,7 +324,7 @@ def test_few_views_are_judged_by_data_fission(noisy, views, monkeypatch):
     told = list[Decision]()
     task = replace(noisy.of_views(np.array(views)), on_start=lambda decision, guess: told.append(decision))
     found, _ = best_cut(task, 2)
-    assert (told[-1].name, told[-1].choice, told[-1].by) == (BODIES, MORE, BY_FISSION)
+    assert (told[-1].name, told[-1].choice, told[-1].by, told[-1].compared[0].least) == (BODIES, MORE, BY_FISSION, 0.0)
     assert torch.equal(found.vertices, mesh_of(4).vertices)
 
 
