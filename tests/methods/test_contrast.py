@@ -140,7 +140,7 @@ def test_fitted_frames_are_those_that_volumes_were_made_of(cells):
 def test_a_crack_is_a_hole_that_fitted_frames_tell():
     """Of a thin crack through the field, which views along it show."""
     kind = MATTER["crack"](64e-6)
-    air, medium = (parse_material(name).delta_beta(20.0) for name in (kind.named[0], kind.named[2]))
+    air, medium = (parse_material(name).delta_beta(20.0) for name in ("air", "PMMA"))
     drawn = kind.drawn(Substances(air, None, medium), 1)
     views = Views.evenly_spaced(8, shape=(64, 64), pixel_size=PIXEL)
     scan = simulate(
