@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from helpers.holographic import CELL, PIXEL, SHAPE, cells, scan_of
 from holosplat.baselines import HolographicTV, holographic_tv
 from holosplat.baselines.holographic_tv import Correction
-from holosplat.baselines.material import estimate_delta, estimate_ratio
+from holosplat.baselines.material import estimate_delta
 from holosplat.baselines.tomography import plateau
 from holosplat.beamline.light import UnevenLight
 from holosplat.checks import InputError
@@ -216,21 +216,6 @@ def test_no_iterations_are_refused(cell_scan):
 
 
 # --- what the holograms say about the material --------------------------------------------------------------
-
-
-def test_the_ratio_of_haemoglobin_is_found(cell_scan):
-    fractions: list[float] = []
-    found = estimate_ratio(cell_scan, lambda stage, fraction: fractions.append(fraction))
-    assert CELL.ratio / 2.5 < found < 2.5 * CELL.ratio
-    assert fractions == sorted(fractions)
-    assert 0 <= fractions[0] < fractions[-1] < 1
-
-
-def test_the_ratio_is_that_of_the_matter_not_a_habit():
-    """Matter that absorbs ten times as much gives a ratio several times lower."""
-    dark = DeltaBeta(CELL.delta, 10 * CELL.beta)
-    found = estimate_ratio(scan_of(cells(dark), Views.evenly_spaced(8, SHAPE, PIXEL)), quiet)
-    assert dark.ratio / 2.5 < found < 2.5 * dark.ratio
 
 
 def test_delta_is_found_where_the_ratio_is_known(cell_scan):

@@ -17,13 +17,13 @@ import pytest
 from torch import Tensor
 
 from holosplat.baselines import HolographicTV, holographic_tv
-from holosplat.baselines.material import estimate_delta, estimate_ratio
+from holosplat.baselines.material import estimate_delta
 from holosplat.geometry import Grid
 from holosplat.inference import Decision
 from holosplat.matter import DeltaBeta
 from holosplat.methods import Task
 from holosplat.methods.contrast import BELOW, BOTH, SPHERICAL, Scoring, both_sides, decide_sides, decide_sign, with_sign
-from holosplat.methods.cross_validation import FirstVolumes
+from holosplat.methods.cross_validation import FirstVolumes, unseen_ratio
 from holosplat.methods.illumination import decided
 from holosplat.methods.levels import decide_matter
 from holosplat.methods.volume import material_of_levels
@@ -102,8 +102,9 @@ def once(memory: Once) -> Iterator[None]:
         two = both_sides(first)
         return FirstVolumes(two.folds, with_sign(two.prior, (made,)), two.on_progress, two.options), made
 
-    def ratio(scan: Scan, on_progress: Progress, *how: Any) -> float:
-        return memory.answer(("ratio", *of(scan), *how), lambda told: estimate_ratio(scan, told, *how), on_progress)
+    def ratio(first: FirstVolumes) -> Decision:
+        key = ("ratio", *of(first.folds.scan), first.prior, first.options)
+        return memory.answer(key, lambda told: unseen_ratio(replace(first, on_progress=told)), first.on_progress)
 
     def delta(scan: Scan, known: float, on_progress: Progress, *how: Any) -> float:
         key = ("delta", *of(scan), known, *how)
@@ -131,8 +132,8 @@ def once(memory: Once) -> Iterator[None]:
         "illumination.decided": light,
         "illumination.decide_sign": sign,
         "illumination.decide_sides": sides,
-        "ground.estimate_ratio": ratio,
-        "ground.estimate_delta": delta,
+        "cross_validation.unseen_ratio": ratio,
+        "cross_validation.estimate_delta": delta,
         "start.material_of_levels": level,
         **{f"{module}.holographic_tv": begin for module in ("start", "volume", "voxels")},
     }

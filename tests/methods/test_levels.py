@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from helpers.runs import KNOWN, SMALL
+from holosplat.baselines.material import LIKELY_RATIOS
 from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError, NoMatterError
 from holosplat.geometry import Grid, Views
@@ -24,13 +25,11 @@ from holosplat.methods.levels import (
     SHOWN,
     TrialFits,
     decide_matter,
-    decide_ratio,
     flattened,
-    ratio_of_one,
 )
 from holosplat.methods.method import first_of_task
 from holosplat.methods.trials import WITHOUT, plain_light
-from holosplat.methods.uncertain import LIKELY_RATIOS, Determined
+from holosplat.methods.uncertain import Determined
 from holosplat.optics.background import LightOptions
 from holosplat.representations import Stored, VoxelGrid
 from holosplat.scan import Exposures, Scan
@@ -210,53 +209,6 @@ def test_kinds_are_compared_at_the_likeliest_ratio(soft, monkeypatch, is_lit, ra
 
 def likely(ratio: float) -> Determined:
     return Determined("delta_beta", ratio, 0.9 * ratio, 1.1 * ratio, LIKELY_RATIOS, True)
-
-
-@pytest.mark.parametrize("kind", ["soft", "sharp"])
-@pytest.mark.parametrize(("true", "likeliest"), [(300.0, 300.0), (1e6, 300.0), (300.0, LIKELY_RATIOS[1])])
-def test_absorption_is_taken_where_it_predicts_unseen_views(kind, true, likeliest, monkeypatch):
-    """Of matter that absorbs, and not of matter that does not, whatever explains the fitted frames."""
-    material = DeltaBeta(MATERIAL.delta, MATERIAL.delta / true)
-    size = (40e-6, 38e-6, 40e-6)
-    cells = soft_cells(4, (14e-6, 20e-6), size, material, seed=5, edge=3e-6)
-    sharp = MeshScene.of_one_material(random_cells(4, size, 5, 17e-6), material)
-    task = Task(measured(cells if kind == "soft" else sharp), MaterialPrior.unknown(1))
-    place = import_module("holosplat.methods.levels")
-    asked = list[Task]()
-    monkeypatch.setattr(place, "likeliest_ratio", lambda task: asked.append(task) or likely(likeliest))
-    there, (decision,) = decide_ratio(task, first_of_task(task))
-    found = ratio_of_one(task, there)
-    assert len(asked) == 1
-    assert (decision.name, decision.by) == ("δ/β in frames as measured", "views set aside")
-    assert found.value == (likeliest if true == likeliest else LIKELY_RATIOS[1])
-    assert there.material.ratio == pytest.approx(found.value)
-    if likeliest < LIKELY_RATIOS[1] and found.value != likeliest:
-        assert not found.told
-        assert (found.low, found.high) == (0.9 * likeliest, LIKELY_RATIOS[1])
-        assert decision.line == found.remark
-
-
-def test_an_estimate_stands_where_the_likelihood_tells_none(soft, monkeypatch):
-    place = import_module("holosplat.methods.levels")
-    monkeypatch.setattr(place, "likeliest_ratio", lambda task: replace(likely(300.0), told=False))
-    task = Task(soft, MaterialPrior.unknown(1))
-    first = first_of_task(task)
-    assert decide_ratio(task, first) == (first, ())
-    assert ratio_of_one(task, first).value == 300.0
-
-
-def test_a_ratio_is_found_again_in_other_light(soft, monkeypatch):
-    """As the likelihood has it: light that was found at one δ/β speaks for this."""
-    asked = list[Task]()
-    place = import_module("holosplat.methods.levels")
-    monkeypatch.setattr(place, "likeliest_ratio", lambda task: asked.append(task) or likely(3000.0))
-    task = Task(soft, MaterialPrior.unknown(1))
-    first = first_of_task(task)
-    for taken in ((), (), ("fixed pattern",), ()):
-        first.taken = taken
-        there, decisions = decide_ratio(task, first)
-        assert (there is first) is (decisions == ()) is bool(taken)
-    assert len(asked) == 2
 
 
 def test_a_fit_that_finds_no_matter_predicts_frames_without_any(soft, monkeypatch):

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 
-from holosplat.baselines.material import MaterialEstimate, estimate_ratio
 from holosplat.baselines.two_materials import Levels, TwoMaterials, told_apart
 from holosplat.checks import InputError
 from holosplat.geometry import Grid
@@ -63,35 +61,9 @@ class Frames:
         return self
 
 
-def test_a_ratio_that_leaves_no_matter_is_none_that_is_found(monkeypatch):
-    def volume(scan, ratio, backend, options, sign):
-        return torch.full((2, 2, 2), {10: 1.0, 100: 2.0}.get(round(ratio), 0.0))
-
-    monkeypatch.setattr("holosplat.baselines.material._trial_volume", volume)
-    how = MaterialEstimate(lowest=1.0, highest=4.0, tried=4)
-    assert estimate_ratio(Frames(), quiet, options=how) == pytest.approx(10 ** (2 - 1 / 6))  # pyright: ignore[reportArgumentType]
-    monkeypatch.setattr("holosplat.baselines.material._trial_volume", lambda *given: torch.zeros(2, 2, 2))
-    with pytest.raises(InputError, match="found no matter"):
-        estimate_ratio(Frames(), quiet, options=how)  # pyright: ignore[reportArgumentType]
-
-
-def test_as_many_ratios_are_tried_as_are_asked_for(monkeypatch):
-    tried = []
-
-    def volume(scan, ratio, backend, options, sign):
-        tried.append(ratio)
-        return torch.ones(2, 2, 2)
-
-    monkeypatch.setattr("holosplat.baselines.material._trial_volume", volume)
-    estimate_ratio(Frames(), quiet, options=MaterialEstimate(lowest=1.0, highest=3.0, tried=5))  # pyright: ignore[reportArgumentType]
-    np.testing.assert_allclose(tried, [10, 10**1.5, 100, 10**2.5, 1000])
-
-
 @pytest.mark.parametrize(
     ("assignment", "message"),
     [
-        ("estimate.tried=2", "estimate: tried must be at least 3, but it is 2"),
-        ("estimate.lowest=5", r"estimate: lowest must be below highest, 4\.25, but it is 5"),
         ("estimate.width=0", "width must be at least 1"),
         ("two_materials.rounds=0", "two_materials: rounds must be at least 1, but it is 0"),
         ("two_materials.blur=-1", "blur must not be negative"),

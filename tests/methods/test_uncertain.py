@@ -14,12 +14,11 @@ from helpers.blobs import SHAPE, blob_scan
 from helpers.soft import DISTANCE, MATERIAL, PIXEL, two_cells
 from holosplat.baselines import HolographicTV
 from holosplat.baselines.beyond import rows_beyond
-from holosplat.baselines.material import estimate_ratio
 from holosplat.checks import InputError
 from holosplat.inference import Score
 from holosplat.matter import MaterialPrior
 from holosplat.methods import Task
-from holosplat.methods.method import quiet
+from holosplat.methods.method import first_of_task
 from holosplat.methods.profile import Profile, ProfileOptions, exposed, without_specks
 from holosplat.methods.uncertain import (
     Determined,
@@ -71,6 +70,10 @@ def test_a_ratio_is_found_where_nothing_is_known(scan):
     assert found.low < MATERIAL.ratio < found.high
 
 
+def ratio_of(scan) -> float:
+    return first_of_task(Task(scan, MaterialPrior.unknown())).material.ratio
+
+
 def test_the_search_begins_at_the_estimate_within_the_range(scan, monkeypatch):
     """Of δ/β, and of nothing else: a distance begins in the middle of its range."""
     tried = list[dict[str, float]]()
@@ -80,13 +83,13 @@ def test_the_search_begins_at_the_estimate_within_the_range(scan, monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Profile, "__call__", first)
-    estimate = estimate_ratio(scan, quiet)
+    estimate = ratio_of(scan)
     for high in (2 * estimate, 0.5 * estimate):
         ranges = Uncertain(distance=(0.04, 0.09), delta_beta=(0.1 * estimate, high))
         with pytest.raises(KeyboardInterrupt):
             determine(Task(scan, MaterialPrior.unknown()), ranges, QUICK)
     assert [one["distance"] for one in tried] == pytest.approx([0.06, 0.06])
-    at = estimate_ratio(replace(scan, exposures=replace(scan.exposures, distance=0.06)), quiet)
+    at = ratio_of(replace(scan, exposures=replace(scan.exposures, distance=0.06)))
     assert [one["delta_beta"] for one in tried] == pytest.approx([at, 0.5 * estimate])
 
 

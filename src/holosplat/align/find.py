@@ -12,7 +12,7 @@ from ..checks import require
 from ..frames import evenly
 from ..inference import Decision, Score
 from ..matter import DeltaBeta, Known, MaterialPrior
-from ..methods.ground import assumed_material
+from ..methods.cross_validation import assumed_material
 from ..model import Alignment
 from ..optics.background import LightOptions
 from ..progress import Advance, Progress

@@ -15,7 +15,7 @@ from ..checks import require
 from ..geometry import Grid
 from ..inference import Decision, Score, select
 from ..matter import DeltaBeta, Known, MaterialPrior
-from ..methods.ground import assumed_material
+from ..methods.cross_validation import assumed_material
 from ..methods.surface_fit import oversampling
 from ..optics.background import Light, LightOptions
 from ..optics.retrieval import paganin

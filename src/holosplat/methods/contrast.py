@@ -11,14 +11,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
-import torch
-
 from ..baselines import HolographicTV
 from ..checks import InputError
 from ..inference import Decision, Score, select
 from ..matter import MaterialPrior
 from ..optics.background import LightOptions
-from .cross_validation import BY_FISSION, FirstVolumes
+from .cross_validation import BY_FISSION, FirstVolumes, without_matter
 from .trials import WITHOUT, Hypothesis, Trials, name_of
 
 STAGE = "sign of the contrast"
@@ -87,7 +85,9 @@ def decide_sides(
     one = ABOVE if first.prior.delta_sign > 0 else BELOW
     two = both_sides(first)
     lit, single = f"{one} in {name_of(first.taken)}", Trials(first, light)
-    spheres, ball = (replace(two, prior=each.prior.about_a_point(), _made={}) for each in (two, first))
+    spheres, ball = (
+        replace(two, prior=each.prior.about_a_point(), _material=each.material, _made={}) for each in (two, first)
+    )
     trials = {one: (single, told), SPHERICAL: (Trials(spheres, light), told), BOTH: (Trials(two, light), told)}
     if first.taken != told:
         trials[lit] = single, first.taken
@@ -135,13 +135,6 @@ def both_sides(first: FirstVolumes) -> FirstVolumes:
     usual = HolographicTV()
     how = replace(first.options, retrieval=usual.retrieval, iterations=usual.iterations)
     return FirstVolumes(first.folds, first.prior.on_both_sides(), first.on_progress, how)
-
-
-def without_matter(first: FirstVolumes, fold: int, fitted: bool = False) -> Score:
-    """The score of even light on the unseen frames of a fold, or on the fitted ones."""
-    seen, unseen = first.folds.split(fold)
-    scan = seen if fitted else unseen
-    return Score.of(scan.left(torch.ones(scan.frames.shape, dtype=torch.float64)))
 
 
 def with_sign(prior: MaterialPrior, decisions: Sequence[Decision]) -> MaterialPrior:

@@ -13,18 +13,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..backends import resolve
+from ..backends import Backend, resolve
 from ..baselines import HolographicTV, holographic_tv
 from ..baselines.algebraic import Algebraic, sirt
 from ..baselines.beyond import margins_of
 from ..baselines.holographic_tv import Correction, retrieved
+from ..baselines.material import DEFAULT, RATIOS, MaterialEstimate, estimate_delta
+from ..checks import InputError
 from ..fit.whitened import WhitenedFrames
 from ..frames import evenly
 from ..geometry import Grid
+from ..inference import Decision, Score, select
 from ..matter import DeltaBeta, KnownRatio, MaterialPrior, Matter
 from ..memory import memory_kept
 from ..model import Instrument, Model
-from ..optics.background import Background, Light
+from ..optics.background import Background, Light, LightOptions
 from ..optics.noise import NoiseModel, noise_levels
 from ..optics.retrieval import paganin
 from ..optics.sampling import alike, fringe_sampling
@@ -32,7 +35,6 @@ from ..progress import Progress
 from ..representations import Stored, VoxelGrid
 from ..scan import Exposures, Scan
 from ..volume import Object
-from .ground import assumed_material
 from .spherical import likeliest_sphere
 
 DRAWS = 16
@@ -105,6 +107,8 @@ EFFORT = 0.2
 CHECKED = 4
 """Edge of the squares [pixels], in which unknown light of unseen frames is fitted and tested in turns."""
 
+STAGE = "δ/β of first volumes"
+
 T = TypeVar("T")
 
 BY_VIEWS, BY_FISSION = "views set aside", "data fission"
@@ -154,8 +158,9 @@ class Folds:
 
     @classmethod
     def of(cls, train: Scan, binning: int | None = None, fewest: int = FEWEST) -> Folds:
-        """Of training frames of one time. binning: of pixels along an edge; None: as many as leave coarse frames;
-        fewest: views from which on some are set aside."""
+        """Of training frames; of several times, of those in the middle. binning: of pixels along an edge; None: as many
+        as leave coarse frames;        fewest: views from which on some are set aside."""
+        train = train.at_instant(len(train.instants) // 2) if train.is_series else train
         binning, views = binning or coarse_binning(train), len(train)
         by, most = (BY_FISSION, 1) if views < fewest else (BY_VIEWS, MOST if views >= MANY else views)
         return cls(train.binned(binning), most, by, binning, train.views.shape)
@@ -196,6 +201,7 @@ class FirstVolumes:
     )
     taken: tuple[str, ...] = ()
     """What was decided of light and noise."""
+    _ratio: float | None = None
     _material: DeltaBeta | None = None
     _made: dict[tuple[object, int], object] = field(default_factory=dict)
 
@@ -203,14 +209,26 @@ class FirstVolumes:
     def material(self) -> DeltaBeta:
         """The one material that stands for all matter, of the frames as they were measured."""
         if self._material is None:
-            self._material = assumed_material(self.folds.scan, self.prior, self.on_progress, self.options.backend)
+            prior = self.prior
+            if self._ratio or not prior.fixes_ratio:
+                prior = prior.with_ratio(self._ratio or float(self.ratio.choice))
+            self._material = assumed_material(self.folds.scan, prior, self.on_progress, self.options.backend)
         return self._material
+
+    @property
+    def ratio(self) -> Decision:
+        """δ/β of matter of which nothing is known (`unseen_ratio`)."""
+        return self.once("ratio", 0, lambda: unseen_ratio(self))
 
     def at_ratio(self, ratio: float) -> FirstVolumes:
         """Volumes of the same folds, of one material of δ/β `ratio`."""
-        prior = self.prior.with_ratio(ratio)
-        material = assumed_material(self.folds.scan, prior, self.on_progress, self.options.backend)
-        return replace(self, _material=material, _made={})
+        return replace(self, _ratio=ratio, _material=None, _made={})
+
+    def as_measured(self, fold: int) -> Score:
+        """The score of the volume of a fold in even light and white noise, on the unseen frames."""
+        seen, unseen = self.folds.split(fold)
+        volume = self.volume(fold, plain_light(seen.measured, LightOptions()))
+        return Score.of(unseen.left(predictions(volume, unseen).double()))
 
     @property
     def _how(self) -> HolographicTV:
@@ -239,6 +257,60 @@ class FirstVolumes:
     def _thickness(self) -> Tensor:
         """What phase retrieval finds in all coarse frames as they were measured, each by itself: folds share it."""
         return retrieved(self.folds.scan, self.material, self._how, self.on_progress)
+
+
+def unseen_ratio(first: FirstVolumes) -> Decision:
+    """δ/β whose volumes of frames as measured predict unseen ones better than those of any larger one of `RATIOS` do.
+
+    The null is the largest, of matter that absorbs least, for absorption may also stand for what else the model lacks.
+    Where there is no matter of a ratio, its prediction is even light.
+    """
+    tried = {f"{ratio:.6g}": first.at_ratio(ratio) for ratio in RATIOS}
+
+    def score(name: str, fold: int) -> Score:
+        try:
+            return tried[name].as_measured(fold)
+        except InputError:  # there is no such matter
+            return without_matter(first, fold)
+
+    first.on_progress(STAGE, 0.0)
+    return select(STAGE, tuple(tried), score, first.folds.count, by=first.folds.by)
+
+
+def assumed_material(
+    scan: Scan,
+    prior: MaterialPrior,
+    on_progress: Progress,
+    backend: Backend = "auto",
+    options: MaterialEstimate = DEFAULT,
+) -> DeltaBeta:
+    """δ and β of one material for all matter: as known, or as the training frames `scan` suggest.
+
+    Where several are known, it has the δ of the first, and the ratio of an equal mixture. What is not known has the
+    sign of δ that the prior says, or is above the medium where it says none, and the δ/β of `FirstVolumes.ratio`.
+    """
+    if prior.materials:
+        deltas, betas = zip(*prior.materials)
+        return DeltaBeta(deltas[0], deltas[0] * sum(betas) / sum(deltas)) if betas[1:] else prior.materials[0]
+    if isinstance(prior, KnownRatio):
+        ratio = prior.ratio
+    else:
+        ratio = float(FirstVolumes(Folds.of(scan), prior, on_progress).ratio.choice)
+    delta = estimate_delta(scan, ratio, on_progress, backend, options, prior.delta_sign, prior.two_sided)
+    return DeltaBeta(delta, delta / ratio)
+
+
+def plain_light(frames: Tensor, options: LightOptions) -> Light:
+    """Even light and white noise."""
+    air = options.air_of(frames)
+    return Light(air, NoiseModel.of_frames(frames, air), None)
+
+
+def without_matter(first: FirstVolumes, fold: int, fitted: bool = False) -> Score:
+    """The score of even light on the unseen frames of a fold, or on the fitted ones."""
+    seen, unseen = first.folds.split(fold)
+    scan = seen if fitted else unseen
+    return Score.of(scan.left(torch.ones(scan.frames.shape, dtype=torch.float64)))
 
 
 def lit_by_halves(measured: Tensor, predicted: Tensor, known: Background) -> Tensor:

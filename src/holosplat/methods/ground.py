@@ -1,5 +1,4 @@
-"""What every fit to frames stands on: training and validation frames, wave optics, and the data term; and the materials
-of a first volume: the one that stands for all matter, or the levels of those that are known."""
+"""What every fit to frames stands on: training and validation frames, wave optics, and the data term."""
 
 from __future__ import annotations
 
@@ -8,41 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from ..backends import Backend
-from ..baselines.material import DEFAULT, MaterialEstimate, estimate_delta, estimate_ratio
 from ..checks import InputError, require
 from ..fit.problem import Schedule, Term
 from ..fit.residuals import Judge, set_aside, split_validation
 from ..fit.terms import TERMS, FrameTerm, Objective
-from ..matter import DeltaBeta, KnownRatio, MaterialPrior, Matter
+from ..matter import Matter
 from ..model import Instrument, Model, SolvedLight
 from ..optics.background import Light
 from ..optics.sampling import fringe_sampling
-from ..progress import Progress
 from ..ranges import checked_dataclass
 from ..scan import Scan
 from ..volume import Object
-
-
-def assumed_material(
-    scan: Scan,
-    prior: MaterialPrior,
-    on_progress: Progress,
-    backend: Backend = "auto",
-    options: MaterialEstimate = DEFAULT,
-) -> DeltaBeta:
-    """δ and β of one material for all matter: as known, or as the training frames `scan` suggest.
-
-    Where several are known, it has the δ of the first, and the ratio of an equal mixture. What is estimated has the
-    sign of δ that the prior says, or is above the medium where it says none.
-    """
-    if prior.materials:
-        deltas, betas = zip(*prior.materials)
-        return DeltaBeta(deltas[0], deltas[0] * sum(betas) / sum(deltas)) if betas[1:] else prior.materials[0]
-    how = (on_progress, backend, options, prior.delta_sign)
-    ratio = prior.ratio if isinstance(prior, KnownRatio) else estimate_ratio(scan, *how)
-    delta = estimate_delta(scan, ratio, *how, prior.two_sided)
-    return DeltaBeta(delta, delta / ratio)
 
 
 @checked_dataclass

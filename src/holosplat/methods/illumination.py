@@ -26,10 +26,9 @@ from .auto import Auto
 from .continued import Continued
 from .contrast import STAGE as SIGN
 from .contrast import Scoring, decide_sides, decide_sign, with_sign
-from .cross_validation import BY_FISSION, EFFORT, FirstVolumes, predicted_frames
-from .ground import assumed_material
+from .cross_validation import BY_FISSION, EFFORT, FirstVolumes, assumed_material, predicted_frames
 from .levels import SHOWN, TrialFits, blind, decide_ratio
-from .method import Method, Task, first_of_task
+from .method import Method, Task, first_of_task, one_material
 from .trials import UNEVEN, WITHOUT, Hypothesis, Trials, name_of, named, plain_light, rivals, with_more
 from .volume import SmoothVolume
 
@@ -142,9 +141,10 @@ def prepared(task: Task, method: Method | None = None, before: Prepared | None =
     told = tuple([UNEVEN] * (options.kind == "smooth"))
     if before is None:
         spherical = isinstance(method, Auto | SmoothVolume)
-        free = spherical and not (task.prior.fixes_ratio or task.prior.two_sided or task.scan.is_series)
+        free = not (task.prior.fixes_ratio or task.prior.two_sided or task.scan.is_series)
         if free:  # light and noise would make up for a wrong δ/β, so they are compared after it
-            first, ratio = decide_ratio(task, first)
+            lights = tuple(one for one in open_to if one != CORRELATED)  # noise does not pass for absorption
+            first, ratio = decide_ratio(task, first, lambda one: decided(one, options, told, lights)[0], spherical)
             task = replace(task, decisions=(*task.decisions, *ratio))
         task.on_progress(STAGE, 0.0)
         first.taken, made = decided(first, options, told, open_to)
@@ -168,8 +168,9 @@ def prepared(task: Task, method: Method | None = None, before: Prepared | None =
     else:
         first = replace(first, prior=task.prior)
         first.taken, made = before[0], tuple(each for each in before[1] if each.name != SIGN)
+    task = replace(task, decisions=(*task.decisions, *made), first=first)
     scan, light = _applied(task, light, first.taken)
-    return replace(task, scan=scan, lit=light, decisions=(*task.decisions, *made), first=first)
+    return replace(task, scan=scan, lit=light)
 
 
 def _open_to(task: Task, method: Method | None) -> Hypothesis:
@@ -219,7 +220,7 @@ def _applied(task: Task, light: Light, taken: Hypothesis) -> tuple[Scan, Light]:
 
     def predict(light: Light) -> Tensor:
         how = HolographicTV(upper=0.0, two_sided=task.prior.two_sided)
-        return predicted_first(evened(light), task.prior, how, task.on_progress, light)
+        return predicted_first(evened(light), one_material(task), how, task.on_progress, light)
 
     for one in order:
         if one != UNEVEN and task.scan.is_series:

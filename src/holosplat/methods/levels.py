@@ -8,31 +8,35 @@ kind are fitted to the coarse frames.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from ..baselines.material import LIKELY_RATIOS
 from ..baselines.tomography import plateau
 from ..baselines.two_materials import best_levels, eroded, told_apart
 from ..checks import InputError, NoMatterError
 from ..inference import Decision, Score, select
 from ..matter import MatterKind
 from ..representations import Stored, VoxelGrid
-from .contrast import without_matter
-from .cross_validation import BY_FISSION, EFFORT, FirstVolumes, predictions
+from .cross_validation import BY_FISSION, EFFORT, FirstVolumes, predictions, without_matter
 from .method import Method, Task, first_of_task, solve_stages
-from .trials import NULL, WITHOUT, Hypothesis, Trial, Trials, accepted, hypothesis_of, name_of
-from .uncertain import LIKELY_RATIOS, Determined, likeliest_ratio
+from .trials import WITHOUT, Hypothesis, Trial, Trials, accepted, hypothesis_of, name_of
+from .uncertain import Determined, likeliest_ratio
 
 STAGE = "levels or continuous matter"
 SHOWN = "matter in first volumes"
 NAME, RATIO = "matter", "δ/β in frames as measured"
 LEVELS = ("one level", "two levels")
+IN_LIGHT = " in the light that it calls for"
 SEVERAL = "several levels"
 CONTINUOUS = "continuous"
+
+Lit = Callable[[FirstVolumes], Hypothesis]
+"""What first volumes call for of light and noise."""
 
 
 def decide_matter(task: Task, methods: Mapping[MatterKind, Method] | None = None) -> Decision:
@@ -157,43 +161,55 @@ def ratio_of_one(task: Task, first: FirstVolumes) -> Determined:
     return _ratio(task, first)[0]
 
 
-def decide_ratio(task: Task, first: FirstVolumes) -> tuple[FirstVolumes, tuple[Decision, ...]]:
+def decide_ratio(
+    task: Task, first: FirstVolumes, lit: Lit | None = None, likely: bool = True
+) -> tuple[FirstVolumes, tuple[Decision, ...]]:
     """First volumes of a task of which nothing is known at its δ/β, and whether frames as measured need that.
 
-    The null is the largest of `LIKELY_RATIOS`, of matter that absorbs least. The likeliest one (`likeliest_ratio`) is
-    taken where first volumes of such matter predict unseen frames better: what explains the fitted ones by absorption
-    may be whatever else the model lacks. An estimate stands where the likelihood tells none; and the likeliest in light
-    or noise that was taken, for these were found at the first δ/β. In both cases nothing is decided.
+    The null is the largest of `LIKELY_RATIOS`, of matter that absorbs least. The likeliest one (`likeliest_ratio`), or
+    where the likelihood tells none, or is not asked (`likely`), that of `FirstVolumes.ratio`, is taken where first
+    volumes of such matter predict unseen frames better than those of the null do, as measured and in the light that
+    these call for (`lit`): what explains frames by absorption may be whatever else the model lacks. In light or noise
+    that was taken, which were found at the first δ/β, nothing is decided.
     """
-    found, decision = _ratio(task, first)
+    found, decision = _ratio(task, first, lit, likely)
     if decision is None:
         return first, ()
     there = first.at_ratio(found.value)
     there.once(("ratio", first.taken), 0, lambda: (found, decision))
-    return there, (decision,)
+    return there, (first.ratio, decision)
 
 
-def _ratio(task: Task, first: FirstVolumes) -> tuple[Determined, Decision | None]:
-    return first.once(("ratio", first.taken), 0, lambda: _compared(task, first))
+def _ratio(
+    task: Task, first: FirstVolumes, lit: Lit | None = None, likely: bool = True
+) -> tuple[Determined, Decision | None]:
+    return first.once(("ratio", first.taken), 0, lambda: _compared(task, first, lit, likely))
 
 
-def _compared(task: Task, first: FirstVolumes) -> tuple[Determined, Decision | None]:
-    found = likeliest_ratio(task)
-    if first.taken or not found.told:
-        return found, None
+def _compared(task: Task, first: FirstVolumes, lit: Lit | None, likely: bool) -> tuple[Determined, Decision | None]:
+    if likely:
+        found = likeliest_ratio(replace(task, first=first))
+    else:
+        found = Determined("delta_beta", first.material.ratio, *LIKELY_RATIOS, LIKELY_RATIOS, told=False)
     most = LIKELY_RATIOS[1]
+    if first.taken:
+        return found, None
     tried = {f"{each.value:.4g}": each for each in (replace(found, value=most, high=most, told=False), found)}
     trials = {name: Trials(first.at_ratio(each.value), task.light) for name, each in tried.items()}
+    null, *others = tried
 
     def scored(name: str, fold: int) -> Score:
+        one, within, _ = name.partition(IN_LIGHT)
+        hypothesis = lit(trials[one].first) if within and lit else ()
         try:
-            return trials[name].score(NULL, fold)
+            return trials[one].score(name_of(hypothesis), fold)
         except InputError:  # there is no such matter
             return without_matter(first, fold)
 
-    decision = select(RATIO, tuple(tried), scored, first.folds.count, by=first.folds.by)
+    beside = {other: (null + IN_LIGHT,) for other in others if lit}
+    decision = select(RATIO, tuple(tried), scored, first.folds.count, by=first.folds.by, beside=beside)
     chosen = tried[decision.choice]
-    return (chosen if chosen.told else replace(chosen, remark=decision.line)), decision
+    return (chosen if chosen.told or not likely else replace(chosen, remark=decision.line)), decision
 
 
 def blind(decisions: Iterable[Decision]) -> bool:

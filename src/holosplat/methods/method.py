@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from ..backends import Backend
-from ..baselines.material import MaterialEstimate
+from ..baselines.material import LIKELY_RATIOS
 from ..checks import require
 from ..fit.pose_refinement import PoseRefinement, with_alignment
 from ..fit.run import Run, Running
@@ -44,7 +44,7 @@ STAND_IN_RATIO = 1.0
 
 def shows_no_refraction(scan: Scan) -> bool:
     """Whether no frame could show refraction, even of the softest matter that is looked for."""
-    return bool(absorption_alone(scan.exposures, 10 ** -MaterialEstimate().highest).all())
+    return bool(absorption_alone(scan.exposures, 1 / LIKELY_RATIOS[1]).all())
 
 
 @dataclass(frozen=True)
@@ -155,9 +155,13 @@ def first_of_task(task: Task, backend: Backend = "auto") -> FirstVolumes:
     """The first volumes that the decisions of a task share, computed by `backend` where they are new."""
     if task.first is not None:
         return task.first
-    one_time = task.scan.at_instant(len(task.scan.instants) // 2) if task.scan.is_series else task.scan
-    found = FirstVolumes(Folds.of(one_time), task.prior, task.on_progress)
+    found = FirstVolumes(Folds.of(task.scan), task.prior, task.on_progress)
     return replace(found, options=replace(found.options, backend=backend))
+
+
+def one_material(task: Task) -> MaterialPrior:
+    """What is known of the matter of a task; where its δ/β is not, that of its first volumes."""
+    return task.prior if task.prior.fixes_ratio else task.prior.with_ratio(first_of_task(task).material.ratio)
 
 
 @dataclass(frozen=True)

@@ -28,8 +28,9 @@ from ..ranges import Natural, Rate, Share, Weight, checked_dataclass
 from ..representations import AlignedNetwork, PixelAligned, PixelAlignedField, Stored
 from ..representations.neural_field import grown
 from ..scan import Scan
-from .ground import ExtraTerm, assumed_material, ground
-from .method import Method, Stage, Task
+from .cross_validation import assumed_material
+from .ground import ExtraTerm, ground
+from .method import Method, Stage, Task, one_material
 from .neural_field import visual_hull
 from .volume import binning
 
@@ -134,7 +135,7 @@ class AlignedStage:
         """The guess: of one material, or with δ and β free where waves may tell them apart and nothing is known."""
         options, factor = self.options, binning(task.scan, self.options.max_voxels)
         scan = task.scan.binned(factor)
-        material = assumed_material(scan, task.prior, task.on_progress)
+        material = assumed_material(scan, one_material(task), task.on_progress)
         matter = Matter.one(*material)
         if self.network == ONIX and not task.prior.fixes_ratio:
             matter = matter.freed()

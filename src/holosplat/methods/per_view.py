@@ -14,8 +14,8 @@ from ..geometry import Grid
 from ..matter import Matter
 from ..optics.retrieval import RETRIEVALS
 from ..representations import Stored, VoxelGrid
-from .ground import assumed_material
-from .method import Method, Stage, Task
+from .cross_validation import assumed_material
+from .method import Method, Stage, Task, one_material
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class PerViewStage:
     def start(self, task: Task, before: Stored | None) -> VoxelGrid:
         """Occupancies of the known material, or of the one that the frames suggest."""
         scan, how = task.scan, self.options
-        material = assumed_material(scan, task.prior, task.on_progress)
+        material = assumed_material(scan, one_material(task), task.on_progress)
         retrieve = RETRIEVALS[how.retrieval]
         frames = torch.from_numpy(scan.frames)
         report = task.report("phase retrieval")

@@ -20,8 +20,9 @@ from ..matter import Matter
 from ..ranges import Rate, Weight, checked_dataclass
 from ..representations import SpaceTime, SpaceTimeField, Stored
 from ..representations.space_time import FLOW
-from .ground import ExtraTerm, Ground, assumed_material, ground
-from .method import Method, Stage, Task
+from .cross_validation import assumed_material
+from .ground import ExtraTerm, Ground, ground
+from .method import Method, Stage, Task, one_material
 
 EACH, FLOW_ALONE, THROUGH_WAVES = "each time by itself", "flow of these", "field through the waves"
 FEWEST_TIMES = 2
@@ -102,7 +103,7 @@ class EachTime:
             "several times, with --motion flow, or choose another method.",
         )
         middle = task.scan.at_instant(len(times) // 2)
-        material = assumed_material(middle, task.prior, task.on_progress, self.volume.backend)
+        material = assumed_material(middle, one_material(task), task.on_progress, self.volume.backend)
         bounded, volumes = replace(self.volume, upper=task.bound(1.0)), list[torch.Tensor]()
         for k in range(len(times)):
             task.on_progress(EACH, k / len(times))

@@ -27,6 +27,7 @@ from .cross_validation import (
     Folds,
     coarse_binning,
     lit_by_halves,
+    plain_light,
     predicted_frames,
     predictions,
 )
@@ -106,14 +107,14 @@ class Trials:
 
     def __init__(self, first: FirstVolumes, options: LightOptions) -> None:
         folds = first.folds
-        self._first, self._options = (
+        self.first, self._options = (
             first,
             binned_options(options, folds.shape or folds.scan.views.shape, folds.binning),
         )
 
     def tried(self, hypothesis: Hypothesis, fold: int) -> Trial:
         """The volume and the score of a hypothesis."""
-        return self._first.once(("light", hypothesis), fold, lambda: self._made(hypothesis, fold))
+        return self.first.once(("light", hypothesis), fold, lambda: self._made(hypothesis, fold))
 
     def proposed(self, hypothesis: Hypothesis, fold: int = 0) -> bool:
         """Whether the last part of a hypothesis changes frames by more than the margin of what is left without it: a
@@ -145,41 +146,35 @@ class Trials:
         None where it says nothing of those of the first fold, for which it is proposed; of a later fold it then adds
         nothing.
         """
-        found = self._first.once(("light of", hypothesis), fold, lambda: self._found(hypothesis, fold))
+        found = self.first.once(("light of", hypothesis), fold, lambda: self._found(hypothesis, fold))
         return self._light(hypothesis[:-1], fold) if found is None and fold else found
 
     def _found(self, hypothesis: Hypothesis, fold: int) -> Light | None:
         if not hypothesis:
-            frames = self._first.folds.split(fold)[0].measured
+            frames = self.first.folds.split(fold)[0].measured
             return plain_light(frames, self._options)
         before = self.tried(hypothesis[:-1], fold)
 
         def predict(light: Light) -> Tensor:
             same = light is before.light
-            return before.predicted if same else predictions(self._first.volume(fold, light), before.seen)
+            return before.predicted if same else predictions(self.first.volume(fold, light), before.seen)
 
         return with_more(before.light, hypothesis[-1], before.seen, predict, self._options)
 
     def _made(self, hypothesis: Hypothesis, fold: int) -> Trial:
-        seen, unseen = self._first.folds.split(fold)
+        seen, unseen = self.first.folds.split(fold)
         light = self._light(hypothesis, fold)
         require(
             light is not None, "--light must be even or auto, but it is smooth, and a part of the frames shows no air."
         )
         assert light is not None
-        volume = self._first.volume(fold, light)
+        volume = self.first.volume(fold, light)
         return Trial(volume, light, seen, unseen, predictions(volume, unseen))
 
 
 def accepted(task: Task, first: FirstVolumes, fold: int) -> Trial:
     """The trial of what was decided of light and noise, in a fold."""
     return Trials(first, task.light).tried(first.taken, fold)
-
-
-def plain_light(frames: Tensor, options: LightOptions) -> Light:
-    """Even light and white noise."""
-    air = options.air_of(frames)
-    return Light(air, NoiseModel.of_frames(frames, air), None)
 
 
 def with_more(light: Light, hypothesis: str, seen: Scan, predict: Predict, options: LightOptions) -> Light | None:

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from ..baselines.material import MaterialEstimate, estimate_ratio
+from ..baselines.material import LIKELY_RATIOS
 from ..checks import InputError, require
 from ..matter import DeltaBeta, Known, KnownRatio, KnownSeveral, MaterialPrior
 from ..ranges import checked_dataclass
 from ..scan import Scan
-from .method import Task, shows_no_refraction
+from .method import Task, first_of_task, shows_no_refraction
 from .profile import Profile, ProfileOptions, exposed
 
 STAGE = "uncertain constants"
@@ -36,8 +36,6 @@ TOLD = 0.7
 """A constant is told by the frames if its standard error is less than this part of what the range left open."""
 LIKELY = 2.0
 """Difference of -log of the probability up to which a constant lies within its interval, of about 95 %."""
-LIKELY_RATIOS = (56.0, 18_000.0)
-"""δ/β that matter may have of which nothing is known: heavy elements at low energy, soft matter at high energy."""
 ENOUGH_AIR = 0.1
 """Part of the pixels beside matter below which frames do not show where space is empty."""
 
@@ -153,11 +151,11 @@ def without_idle(profile: Profile, found: tuple[Determined, ...]) -> tuple[Deter
 
 
 def likeliest_ratio(task: Task, options: ProfileOptions | None = None) -> Determined:
-    """δ/β of continuous matter of which nothing is known; an estimate (`estimate_ratio`) where frames do not tell."""
+    """δ/β of continuous matter of which nothing is known; that of its first volumes where the likelihood tells none."""
     found = determine(task, Uncertain(delta_beta=LIKELY_RATIOS), options)[0]
     if found.told:
         return found
-    return replace(found, value=min(max(_estimated_ratio(task, task.scan), found.low), found.high))
+    return replace(found, value=min(max(first_of_task(task).material.ratio, found.low), found.high))
 
 
 def _untold(ranges: Mapping[str, Range], middle: Mapping[str, float], why: str) -> tuple[Determined, ...]:
@@ -215,14 +213,12 @@ def _assumed_ratio(task: Task, middle: Mapping[str, float]) -> float:
     """δ/β for the first volume, at the nominal energy of the task."""
     if task.prior.materials:
         known = task.prior.materials[0]
-        return known.ratio if math.isfinite(known.ratio) else 10 ** MaterialEstimate().highest * 10
+        return known.ratio if math.isfinite(known.ratio) else 10 * LIKELY_RATIOS[1]
     if isinstance(task.prior, KnownRatio):
         return task.prior.ratio
-    return _estimated_ratio(task, exposed(task.scan, middle))
-
-
-def _estimated_ratio(task: Task, scan: Scan) -> float:
-    return estimate_ratio(scan, task.on_progress, sign=task.prior.delta_sign)
+    there = exposed(task.scan, middle)
+    first = first_of_task(task) if there is task.scan else first_of_task(replace(task, scan=there, first=None))
+    return first.material.ratio
 
 
 def _sorted(ends: Range) -> Range:
@@ -275,8 +271,10 @@ class Search:
         return at, step
 
     def _descended(self, at: np.ndarray, i: int, step: float) -> np.ndarray:
-        """From `at`, or an end of the range of constant `i`, by steps [logarithm] to where neither side is likelier."""
-        at = min([at, _with(at, i, self.low[i]), _with(at, i, self.high[i])], key=self._cost)
+        """From `at`, or where nothing tells a constant `i`, an end of its range, by steps [logarithm] to where neither
+        side is likelier."""
+        if self.names[i] not in self.begun:
+            at = min([at, _with(at, i, self.low[i]), _with(at, i, self.high[i])], key=self._cost)
         while True:
             sides = (float(np.clip(at[i] + s * step, self.low[i], self.high[i])) for s in (-1, 1))
             best = min([at, *(_with(at, i, side) for side in sides)], key=self._cost)

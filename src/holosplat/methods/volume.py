@@ -21,9 +21,8 @@ from ..optics.retrieval.spectra import contrast_level
 from ..ranges import Signed, Weight, checked_dataclass
 from ..representations import Stored, VoxelGrid
 from ..scan import Scan
-from .cross_validation import predicted_frames
-from .ground import assumed_material
-from .method import Method, Stage, Task, first_of_task
+from .cross_validation import assumed_material, predicted_frames
+from .method import Method, Stage, Task, first_of_task, one_material
 from .smooth_fit import SmoothFit, SmoothPlan
 from .spherical import SphericalFit
 
@@ -113,7 +112,7 @@ class SmoothStage:
         known, scan = task.unlike_null, task.scan.binned(factor)
         light = known and known.part(torch.arange(len(task.scan)), factor)
         backend = options.volume.backend
-        material = assumed_material(scan, task.prior, task.on_progress, backend, options.estimate)
+        material = assumed_material(scan, one_material(task), task.on_progress, backend, options.estimate)
         beyond = options.volume.beyond and not task.prior.spherical  # which lies in the frames
         how = replace(options.volume, upper=0.0, two_sided=task.prior.two_sided, beyond=beyond)
         first, grid = holographic_tv(scan, material, how, task.on_progress, light)
@@ -184,7 +183,7 @@ def material_of_levels(task: Task, backend: Backend = "auto", options: MaterialE
     """
     prior = task.prior
     if not (task.bounded and isinstance(prior, KnownRatio)):
-        return assumed_material(task.scan, prior, task.on_progress, backend, options)
+        return assumed_material(task.scan, one_material(task), task.on_progress, backend, options)
 
     def found() -> DeltaBeta:
         material = assumed_material(task.scan, prior, task.on_progress, backend, options)

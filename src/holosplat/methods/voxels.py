@@ -24,8 +24,9 @@ from ..optics.sampling import fringe_sampling
 from ..ranges import Weight, checked_dataclass
 from ..representations import Stored, VoxelGrid
 from ..scan import Scan
-from .ground import ExtraTerm, assumed_material, ground
-from .method import Method, Stage, Task
+from .cross_validation import assumed_material
+from .ground import ExtraTerm, ground
+from .method import Method, Stage, Task, one_material
 
 ABSORPTION_REACH = 10.0
 """How much longer than those of δ the steps of a free β are, in units of the material's. At equal lengths β would not
@@ -57,7 +58,7 @@ class HolographicStage:
 
     def start(self, task: Task, before: Stored | None) -> VoxelGrid:
         """Occupancies of the one material that all matter is taken for."""
-        material = assumed_material(task.scan, task.prior, task.on_progress, self.options.backend)
+        material = assumed_material(task.scan, one_material(task), task.on_progress, self.options.backend)
         bounded = replace(self.options, upper=task.bound(1.0), two_sided=task.prior.two_sided)
         values, grid = holographic_tv(task.scan, material, bounded, task.on_progress, task.unlike_null)
         return VoxelGrid(values[None], grid, Matter.one(*material))

@@ -17,8 +17,9 @@ from ..io.paraview import TimeStep, write_pvd
 from ..io.vtk import write_mesh
 from ..matter import KnownSeveral, MaterialPrior
 from ..methods import Task
-from ..methods.ground import assumed_material
+from ..methods.cross_validation import assumed_material
 from ..methods.illumination import prepared
+from ..methods.method import one_material
 from ..motion.body_tracker import Followed, require_times
 from ..motion.elastic import Rest, strain_energy
 from ..motion.flow_reconstruction import FlowOptions, FlowResult, FlowSearch, merged
@@ -106,7 +107,7 @@ def track(
             folder.begin(config | environment("cpu"))
         task = prepared(Task(scan.train(), prior, seed, lambda stage, part: on_progress(stage, part, {}), assumed))
         train = task.scan
-        material = assumed_material(train.at_instant(0), task.prior, task.on_progress)
+        material = assumed_material(train.at_instant(0), one_material(task), task.on_progress)
         found = follow(train, material, options, seed, light=task.uneven, journal=folder, on_progress=on_progress)
         choice = Choice("levels", {}, "soft fit", found.begun, (*task.decisions, *found.decisions))
         done = _in_motion(found, found.bodies, task, choice, found.oversample)
@@ -240,7 +241,7 @@ def reconstruct_moving(
     going = goes_on(folder, config, resume)
     task = prepared(Task(train, prior, seed, lambda stage, part: on_progress(stage, part, {}), assumed))
     mean = merged(task.scan)
-    material = assumed_material(mean, task.prior, task.on_progress)
+    material = assumed_material(mean, one_material(task), task.on_progress)
     search = FlowSearch(task, material, options, Run(folder))
     if not going and ask and not search.moves(search.by_itself(mean, "mean of all times")):
         return None

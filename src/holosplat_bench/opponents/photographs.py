@@ -24,8 +24,9 @@ from holosplat.fit.problem import FIXED, Batch, LossPart, Problem, Schedule
 from holosplat.fit.terms import Objective
 from holosplat.geometry import Grid
 from holosplat.matter import Matter
+from holosplat.methods.cross_validation import assumed_material
 from holosplat.methods.gaussian_options import GaussianRates
-from holosplat.methods.ground import assumed_material, ground
+from holosplat.methods.ground import ground
 from holosplat.methods.method import Method, Stage, Task
 from holosplat.model import Instrument, Model
 from holosplat.optics.retrieval import paganin

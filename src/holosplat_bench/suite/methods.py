@@ -34,7 +34,7 @@ from holosplat.methods import (
     Voxels,
 )
 from holosplat.methods import Method as Options
-from holosplat.methods.ground import assumed_material
+from holosplat.methods.cross_validation import assumed_material
 from holosplat.methods.presets import preset
 from holosplat.optics.retrieval import tikhonov
 from holosplat.planning.acts import of_simulation

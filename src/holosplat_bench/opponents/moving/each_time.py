@@ -17,7 +17,8 @@ from holosplat.fit.problem import Problem, Schedule
 from holosplat.fit.projected_gradient import ProjectedGradient
 from holosplat.fit.terms import Objective
 from holosplat.matter import MaterialPrior, Matter, MatterKind
-from holosplat.methods.ground import assumed_material, ground
+from holosplat.methods.cross_validation import assumed_material
+from holosplat.methods.ground import ground
 from holosplat.methods.illumination import prepared
 from holosplat.methods.method import Method, Stage, Task, finished, quiet, solve_stages
 from holosplat.methods.pinn import FEWEST_TIMES

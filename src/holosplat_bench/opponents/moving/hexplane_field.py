@@ -17,7 +17,7 @@ from holosplat.checks import at_least, positive, require
 from holosplat.fit.loop import Fit
 from holosplat.geometry import Grid
 from holosplat.matter import Matter
-from holosplat.methods.ground import assumed_material
+from holosplat.methods.cross_validation import assumed_material
 from holosplat.methods.method import Method, Stage, Task
 from holosplat.ranges import Pixels, Rate, Share, Weight, checked_dataclass
 from holosplat.representations import Stored, VoxelGrid

@@ -1,0 +1,137 @@
+"""δ/β of matter of which nothing is known: by first volumes, by likelihood, and beside what light explains."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from importlib import import_module
+
+import numpy as np
+import pytest
+
+from holosplat.baselines.material import LIKELY_RATIOS, RATIOS
+from holosplat.beamline.simulate import simulate
+from holosplat.checks import NoMatterError
+from holosplat.geometry import Views
+from holosplat.matter import DeltaBeta, MaterialPrior
+from holosplat.methods import Task
+from holosplat.methods.cross_validation import FirstVolumes
+from holosplat.methods.levels import decide_ratio, ratio_of_one
+from holosplat.methods.method import first_of_task
+from holosplat.methods.uncertain import Determined
+from holosplat.optics.background import FLUX
+from holosplat.scan import Exposures, Scan
+from holosplat.specimens.red_cells import random_cells
+from holosplat.specimens.scene import MeshScene
+from holosplat.specimens.soft_matter import soft_cells
+
+MATERIAL = DeltaBeta(4e-7, 4e-7 / 1500)
+PIXEL, SHAPE = 1.4e-6, (33, 38)  # rectangular, and odd
+SIZE = (40e-6, 38e-6, 40e-6)
+
+
+def measured(scene) -> Scan:
+    exposures = Exposures.of(Views.evenly_spaced(9, SHAPE, PIXEL), 20.0, 0.2)
+    return simulate(scene, exposures, is_test=np.zeros(9, dtype=bool))
+
+
+def bodies(material: DeltaBeta) -> MeshScene:
+    return MeshScene.of_one_material(random_cells(4, SIZE, 5, 17e-6), material)
+
+
+@pytest.fixture(scope="module")
+def soft() -> Scan:
+    return measured(soft_cells(4, (14e-6, 20e-6), SIZE, MATERIAL, seed=5, edge=3e-6))
+
+
+def likely(ratio: float) -> Determined:
+    return Determined("delta_beta", ratio, 0.9 * ratio, 1.1 * ratio, LIKELY_RATIOS, True)
+
+
+@pytest.mark.parametrize("kind", ["soft", "sharp"])
+@pytest.mark.parametrize(("true", "likeliest"), [(300.0, 300.0), (1e6, 300.0), (300.0, LIKELY_RATIOS[1])])
+def test_absorption_is_taken_where_it_predicts_unseen_views(kind, true, likeliest, monkeypatch):
+    """Of matter that absorbs, and not of matter that does not, whatever explains the fitted frames."""
+    material = DeltaBeta(MATERIAL.delta, MATERIAL.delta / true)
+    cells = soft_cells(4, (14e-6, 20e-6), SIZE, material, seed=5, edge=3e-6)
+    task = Task(measured(cells if kind == "soft" else bodies(material)), MaterialPrior.unknown(1))
+    place = import_module("holosplat.methods.levels")
+    asked = list[Task]()
+    monkeypatch.setattr(place, "likeliest_ratio", lambda task: asked.append(task) or likely(likeliest))
+    there, (_, decision) = decide_ratio(task, first_of_task(task))
+    found = ratio_of_one(task, there)
+    assert len(asked) == 1
+    assert (decision.name, decision.by) == ("δ/β in frames as measured", "views set aside")
+    assert found.value == (likeliest if true == likeliest else LIKELY_RATIOS[1])
+    assert there.material.ratio == pytest.approx(found.value)
+    if likeliest < LIKELY_RATIOS[1] and found.value != likeliest:
+        assert not found.told
+        assert (found.low, found.high) == (0.9 * likeliest, LIKELY_RATIOS[1])
+        assert decision.line == found.remark
+
+
+@pytest.mark.parametrize("absorption", [0.1, 10.0])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_first_volumes_find_the_ratio_by_unseen_views(absorption, sign):
+    """Within the step of the ratios that are tried, and of holes as of bodies."""
+    delta = sign * MATERIAL.delta
+    material = DeltaBeta(delta, absorption * sign * MATERIAL.beta)
+    first = first_of_task(Task(measured(bodies(material)), MaterialPrior.unknown(sign)))
+    decision = first.ratio
+    assert (decision.name, decision.by) == ("δ/β of first volumes", "views set aside")
+    assert [float(each.name) for each in decision.compared] == pytest.approx(RATIOS[1:], rel=1e-4)
+    assert first.material.ratio == pytest.approx(float(decision.choice))
+    assert material.ratio / 3.2 < float(decision.choice) < 3.2 * material.ratio
+    assert first.material.delta * sign > 0
+
+
+def test_frames_without_matter_leave_the_largest_ratio(soft):
+    """No ratio predicts them better; and that there is no matter is said when a volume is asked for."""
+    empty = replace(soft, frames=np.ones_like(soft.frames))
+    first = first_of_task(Task(empty, MaterialPrior.unknown(1)))
+    assert float(first.ratio.choice) == LIKELY_RATIOS[1]
+    with pytest.raises(NoMatterError):
+        _ = first.material
+
+
+def test_first_volumes_decide_where_the_likelihood_tells_none_or_is_not_asked(monkeypatch):
+    place = import_module("holosplat.methods.levels")
+    monkeypatch.setattr(place, "likeliest_ratio", lambda task: replace(likely(160.0), told=False))
+    task = Task(measured(bodies(DeltaBeta(MATERIAL.delta, 10 * MATERIAL.beta))), MaterialPrior.unknown(1))
+    there, (first, _) = decide_ratio(task, first_of_task(task))
+    assert there.material.ratio == pytest.approx(160.0)
+    assert not ratio_of_one(task, there).told
+    alone, (same, _) = decide_ratio(task, first_of_task(task), likely=False)
+    assert first == replace(same, seconds=first.seconds)
+    assert alone.material.ratio == pytest.approx(float(first.choice))
+
+
+def test_absorption_must_predict_more_than_the_light_that_other_matter_calls_for(soft, monkeypatch):
+    """Frames of unequal flux pass for matter that absorbs, as long as their light is even."""
+    flux = 1 + 0.03 * np.random.default_rng(3).standard_normal((9, 1, 1))
+    task = Task(replace(soft, frames=(soft.frames * flux).astype(np.float32)), MaterialPrior.unknown(1))
+    monkeypatch.setattr(import_module("holosplat.methods.levels"), "likeliest_ratio", lambda task: likely(300.0))
+    asked = list[FirstVolumes]()
+
+    def lit(first: FirstVolumes) -> tuple[str, ...]:
+        asked.append(first)
+        return (FLUX,)
+
+    dark, (_, alone) = decide_ratio(task, first_of_task(task))
+    there, (_, beside) = decide_ratio(task, first_of_task(task), lit)
+    assert (alone.choice, beside.choice) == ("300", "1.8e+04")
+    assert (dark.material.ratio, there.material.ratio) == pytest.approx((300.0, LIKELY_RATIOS[1]))
+    assert {one.material.ratio for one in asked} == {LIKELY_RATIOS[1]}
+
+
+def test_a_ratio_is_found_again_in_other_light(soft, monkeypatch):
+    """As the likelihood has it: light that was found at one δ/β speaks for this."""
+    asked = list[Task]()
+    place = import_module("holosplat.methods.levels")
+    monkeypatch.setattr(place, "likeliest_ratio", lambda task: asked.append(task) or likely(3000.0))
+    task = Task(soft, MaterialPrior.unknown(1))
+    first = first_of_task(task)
+    for taken in ((), (), ("fixed pattern",), ()):
+        first.taken = taken
+        there, decisions = decide_ratio(task, first)
+        assert (there is first) is (decisions == ()) is bool(taken)
+    assert len(asked) == 2
