@@ -22,7 +22,7 @@ def main(out: Path) -> None:
     scene = hs.MeshScene.of_one_material(cells, material)
     scan = hs.simulate(scene, hs.Exposures.of(views, energy_kev=20.0, distance=0.1), photons_per_pixel=20_000, seed=2)
 
-    # Without a material, the ratio δ/β is the one that gives the most compact volume, and δ varies freely.
+    # Without a material, the ratio δ/β is one that predicts unseen views well, and δ varies freely.
     # Where the start shows two levels, two materials are told apart. See docs/method.md.
     ratio = material.delta / material.beta
     priors = {

@@ -53,14 +53,6 @@ def test_how_much_makes_two_materials_is_an_option():
     assert not found.are_two(TwoMaterials(largest_deviation=0.1))
 
 
-class Frames:
-    class views:
-        shape = (8, 8)
-
-    def coarsened(self, factor):
-        return self
-
-
 @pytest.mark.parametrize(
     ("assignment", "message"),
     [
