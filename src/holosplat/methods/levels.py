@@ -134,7 +134,7 @@ class TrialFits:
 
     def _fit(self, hypothesis: Hypothesis, kind: MatterKind, fold: int, two: bool = False) -> Stored | None:
         """What is fitted; None where no matter is found."""
-        key = ("fit", hypothesis, self._methods[kind], two)
+        key = ("fit", hypothesis, kind, self._methods[kind], two)
         return self._first.once(key, fold, lambda: self._fitted(hypothesis, kind, fold, two))
 
     def _fitted(self, hypothesis: Hypothesis, kind: MatterKind, fold: int, two: bool) -> Stored | None:

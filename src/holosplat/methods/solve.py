@@ -82,7 +82,7 @@ def settled(
     if matter:
         decision = Decision(NAME, matter, "told")
     elif method.wants_levels:
-        decision = decide_matter(task, method.kinds if isinstance(method, Auto) else None)
+        decision = decide_matter(task, _kinds(method, task))
     else:
         decision = Decision(NAME, "levels", "no matter to the method")
     kind = kind_of(decision.choice)
@@ -93,6 +93,14 @@ def settled(
     if one and not task.prior.fixes_ratio:
         constants = (*constants, ratio_of_one(task, first_of_task(task)))
     return Settled(method, kind, decision, constants)
+
+
+def _kinds(method: Method, task: Task) -> Mapping[MatterKind, Method] | None:
+    """The methods whose fits say of which kind matter is, where first volumes do not: of a known material always, for
+    these alone would call cells in few views continuous; else those of `Auto`."""
+    if isinstance(method, Auto):
+        return method.kinds
+    return {"levels": method, "continuous": method} if task.prior.materials else None
 
 
 def solve(method: Method, task: Task, matter: MatterKind | None = None) -> Stored:
