@@ -142,3 +142,21 @@ def test_a_frame_in_contact_helps_one_at_a_distance():
     each = [relative_error(RETRIEVALS["tikhonov"](frames[[v]], where[[v]], DELTA, beta), truth[[v]]) for v in range(2)]
     assert torch.allclose(both[0], both[1], atol=1e-4 * float(truth.max()))
     assert relative_error(both[:1], truth[:1]) < min(each)
+
+
+@pytest.mark.parametrize("name", list(RETRIEVALS))
+def test_frames_of_other_pixels_are_retrieved_on_their_own_raster(name):
+    """Each as it is alone, and two of one size are still joined, wherever they lie."""
+    sizes, beside = PITCH * np.array([1.2, 1.0, 1.2]), np.array([[0.0, 0.0], [0.0, 0.0], [2.0, -1.0]]) * 1.2 * PITCH
+    distances = [FAR * 1.44, FAR, NEAR * 1.44]
+    views = Views.of_pixels(np.repeat(np.eye(3)[None], 3, axis=0), beside, SHAPE, sizes)
+    where = replace(of_poses([0, 0, 0], distances), views=views)
+    each = [
+        replace(where[[n]], views=replace(views[[n]], pitch=float(sizes[n]), scales=None)) for n in range(len(where))
+    ]
+    frames = torch.cat([taken(bodies, one)[1] for one in each])
+    found = RETRIEVALS[name](frames, where, DELTA, BETA)
+    alone = RETRIEVALS[name](frames[[1]], each[1], DELTA, BETA)
+    torch.testing.assert_close(found[[1]], alone, rtol=1e-6, atol=1e-12)
+    coarse = replace(where[[0, 2]], views=replace(views[[0, 2]], pitch=1.2 * PITCH, scales=None))
+    torch.testing.assert_close(found[[0, 2]], RETRIEVALS[name](frames[[0, 2]], coarse, DELTA, BETA))

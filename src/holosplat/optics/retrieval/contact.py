@@ -6,7 +6,7 @@ Behind matter of thickness T the intensity is then `exp(-2 k β T)` (docs/conven
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial, wraps
 from typing import Any, TypeVar, cast
@@ -176,6 +176,15 @@ def _in_bands(
     return found
 
 
+def _of_one_pixel(exposures: Exposures) -> Iterator[tuple[np.ndarray, Exposures]]:
+    """Indices and exposures of the views of each pixel size: those of different sizes share no raster."""
+    sizes = exposures.views.pixel_sizes
+    for size in np.unique(sizes):
+        some = np.flatnonzero(sizes == size)
+        part = exposures[some]
+        yield some, replace(part, views=replace(part.views, pitch=float(size), scales=None))
+
+
 def or_in_contact(method: Method) -> Method:
     """`method` for the views that show refraction, and `contact_thickness` for those that show absorption alone; beside
     a wall that is known, for frames as if without it (`without_wall`)."""
@@ -193,8 +202,14 @@ def or_in_contact(method: Method) -> Method:
         if exposures.wall is not None:
             alone = partial(retrieve, delta=delta, beta=beta, missing=missing, **options)
             return without_wall(alone, frames, exposures, (delta, beta))
-        exposures = exposures.optical
         checked(frames, exposures, delta)
+        if not exposures.views.has_one_pixel and SharedPoses(exposures.optical).any:
+            found = torch.empty_like(frames)
+            for some, part in _of_one_pixel(exposures):
+                gaps = None if missing is None else missing[some]
+                found[some] = retrieve(frames[some], part, delta, beta, missing=gaps, **options)
+            return found
+        exposures = exposures.optical
         poses, bands = SharedPoses(exposures), _bands(missing, frames.shape[1])
         if missing is not None and not poses.any and (bands[:, 1] - bands[:, 0] < frames.shape[1]).any():
             return _in_bands(partial(retrieve, delta=delta, beta=beta, **options), frames, exposures, missing, bands)
