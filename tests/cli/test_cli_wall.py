@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import holosplat as hs
-from helpers.cli import holosplat, worked
-from holosplat.materials import wall_of
+from helpers.cli import holosplat, refused, worked
+from holosplat.materials import parse_material, require_in_wall, wall_of
 from holosplat.model import measure
 from holosplat.workflows import certainty
 
@@ -47,3 +47,21 @@ def test_a_run_is_read_again(run, tmp_path, monkeypatch):
     assert "differs by 0 %" in worked(holosplat("compare", run, run, "--out", tmp_path / "page.html")).out
     worked(holosplat("rehearse", run, "--times", 2))
     worked(holosplat("reconstruct", "--resume", run))
+
+
+def test_the_filling_is_told_and_is_the_medium(scan, tmp_path):
+    out, said = tmp_path / "run", ("--material", "air", "--medium", "water")
+    for wall, medium, words in (
+        ("tube:12e-6:15e-6:glass", said, "with FILLING as the --medium (or vacuum)"),
+        (
+            "tube:12e-6:15e-6:glass:air",
+            said,
+            "FILLING of --wall must be the --medium that matter lies in, but it is air",
+        ),
+        ("tube:12e-6:15e-6:glass:water", ("--material", "PMMA"), "must be the --medium that matter lies in"),
+    ):
+        refused(holosplat("reconstruct", scan, "--wall", wall, *medium, "--out", out), words)
+    assert not out.exists()
+    for wall in ("slab:1e-5:glass:5.8e-7,2.6e-10", "slab:1e-5:glass:Water"):
+        require_in_wall(wall, parse_material("water"))
+    require_in_wall("slab:1e-5:glass:vacuum", None)
