@@ -360,27 +360,38 @@ def wall_of(text: str, energy_kev: float) -> Wall:
     """The wall about the rotation axis that `text` says (`Told.wall`), at an energy [keV].
 
     Behind FILLING may stand :X:Z:TURN, the place of its middle [m] and its turn [degrees]. A material is a name, or
-    DELTA,BETA. Errors: `InputError` for anything else.
+    DELTA,BETA, or vacuum. Errors: `InputError` for anything else.
     """
     kind, *words = text.split(":")
     count = SECTIONS.get(kind, 0)
     sections = [[number_in(part) for part in word.split("x")] for word in words[:count]]
     place = [number_in(word) for word in words[count + 2 :]]
-    good = count and len(words) - count in (1, 2, 5) and all(len(each) <= 2 - (kind == "tube") for each in sections)
+    good = count and len(words) - count in (2, 5) and all(len(each) <= 2 - (kind == "tube") for each in sections)
     require(
         bool(good) and all(map(math.isfinite, [*chain(*sections), *place])),
         "--wall must be tube:INNER:OUTER:MATERIAL:FILLING, cuvette:INNER:OUTER:MATERIAL:FILLING or "
-        f"slab:INNER:MATERIAL:FILLING, with :X:Z:TURN behind that or not, but it is {shown(text)}; write, for "
-        "instance, tube:4e-5:5e-5:glass:water.",
+        "slab:INNER:MATERIAL:FILLING, with FILLING as the --medium (or vacuum) and :X:Z:TURN behind that or not, but "
+        f"it is {shown(text)}; write, for instance, tube:4e-5:5e-5:glass:water.",
     )
 
     def matter_of(word: str) -> tuple[float, float]:
         numbers = [number_in(part) for part in word.split(",")]
         if len(numbers) == 2 and all(map(math.isfinite, numbers)):
             return numbers[0], numbers[1]
-        return parse_material(word).delta_beta(energy_kev)
+        return (0.0, 0.0) if word == "vacuum" else parse_material(word).delta_beta(energy_kev)
 
-    matter, filling = (matter_of(word) if word else (0.0, 0.0) for word in [*words[count:], ""][:2])
+    matter, filling = map(matter_of, words[count : count + 2])
     x, z, turn = place or (0.0, 0.0, 0.0)
     inner, outer = [(each[0], each[-1]) for each in sections] + [None] * (2 - count)
     return Wall(inner, outer, matter, filling, kind == "tube", (x, z), math.radians(turn))  # type: ignore[arg-type]
+
+
+def require_in_wall(text: str, medium: Material | None) -> None:
+    """`InputError` where the wall that `text` says (`wall_of`) is filled with another material than the `medium` (None:
+    vacuum), to which δ and β of matter are differences. A filling said as DELTA,BETA is taken as that of the medium."""
+    kind, *words = text.split(":")
+    filling = words[SECTIONS.get(kind, 0) + 1]
+    good = "," in filling or (None if filling == "vacuum" else parse_material(filling)) == medium
+    require(
+        good, f"the FILLING of --wall must be the --medium that matter lies in, but it is {filling}; say both alike."
+    )

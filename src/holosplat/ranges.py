@@ -88,6 +88,8 @@ Seed = Annotated[int, Within(0, (1 << 63) - 1)]
 
 COUNTED = ("step", "steps", "seconds", "done", "count", "leg", "stage", "round", "oversample", "time_s")
 """What runs count, and never goes below zero."""
+COUNTED_OR_FLAG = "round"
+"""That of those which also says whether a wall is round (`volume.Wall`)."""
 RISING, ANY = Within(0, 1 << 63), Within(-(1 << 64), 1 << 64)
 FLOAT, COUNT = Within(0, LARGEST), Within(0, MOST)
 _ranged: set[type] = set()
@@ -186,7 +188,9 @@ def require_plausible(values: Any, name: str = "", *, others: bool = True) -> No
     elif isinstance(values, list | tuple):
         for value in values:
             require_plausible(value, name, others=others)
-    elif isinstance(values, Real) and (name in COUNTED or (others and not isinstance(values, bool))):
+    elif isinstance(values, bool) and (name not in COUNTED or name == COUNTED_OR_FLAG):
+        return
+    elif isinstance(values, Real) and (name in COUNTED or others):
         fault = (RISING if name in COUNTED else ANY).fault(values)  # pyright: ignore[reportArgumentType]
         require(not fault, f"{name} {fault}, but it is {_shown(values)}; it is not what was written.")  # pyright: ignore[reportArgumentType]
 

@@ -246,3 +246,14 @@ def test_light_that_is_uneven_stays_beside_bodies(bodies):
     first.taken, _ = decided(first, LightOptions(), (), ("fixed pattern",))
     assert first.taken
     assert decide_sides(first, LightOptions())[1].choice == ABOVE
+
+
+def test_methods_of_one_level_refuse_several_materials(bodies):
+    """Before anything is computed; those that take several are named."""
+    two = MaterialPrior.known(WATER, WATER._replace(delta=0.4 * WATER.delta))
+    taking = [name for name, method in METHODS.items() if method.several]
+    remedy = f"give one, or take --method {', '.join(taking[:-1])} or {taking[-1]}"
+    for method in (one for one in METHODS.values() if not one.several):
+        said = rf"--material must be given once for the method {method.kind}, .* it is given 2 times; {remedy}\."
+        with pytest.raises(InputError, match=said):
+            hs.reconstruct(bodies, two, method, on_progress=lambda *given: pytest.fail("something is computed"))

@@ -212,6 +212,14 @@ def test_what_cannot_be_uncertain_is_refused(scan):
         determine(Task(other, RATIO), Uncertain(distance=(0.1, 0.3)))
 
 
+def test_a_bandwidth_that_no_fit_can_sum_is_refused_before_any_fit(scan, monkeypatch):
+    """Its upper end takes too many energies."""
+    monkeypatch.setattr("holosplat.methods.uncertain.Profile", lambda *given: pytest.fail("a fit was prepared"))
+    far = replace(scan, exposures=replace(scan.exposures, distance=np.full(len(scan), 50.0)))
+    with pytest.raises(InputError, match=r"a bandwidth of 0\.4 washes out .* more than 32 energies"):
+        determine(Task(far, RATIO), Uncertain(bandwidth=(0.001, 0.4)))
+
+
 def test_what_was_determined_is_read_from_its_table():
     from holosplat.tables import to_table
 

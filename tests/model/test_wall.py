@@ -139,7 +139,7 @@ def a_scan() -> hs.Scan:
 
 def test_what_is_said_of_a_wall():
     glass = hs.materials.parse_material("glass").delta_beta(20.0)
-    found = wall_of("tube:1e-5:2e-5:glass", 20.0)
+    found = wall_of("tube:1e-5:2e-5:glass:vacuum", 20.0)
     assert found == Wall((1e-5, 1e-5), (2e-5, 2e-5), glass, round=True)
     found = wall_of("cuvette:1e-5x2e-5:3e-5:1e-6,2e-9:glass:1e-6:0:90", 20.0)
     assert (found.inner, found.outer, found.matter) == ((1e-5, 2e-5), (3e-5, 3e-5), (1e-6, 2e-9))
@@ -148,16 +148,24 @@ def test_what_is_said_of_a_wall():
 
 
 @pytest.mark.parametrize(
-    "text", ["tube", "pipe:1:2:glass", "tube:a:2:glass", "tube:1x2:3:glass", "slab:1:glass:water:2"]
+    "text",
+    [
+        "tube",
+        "pipe:1:2:glass:water",
+        "tube:a:2:glass:water",
+        "tube:1x2:3:glass:water",
+        "slab:1:glass:water:2",
+        "slab:1:glass",
+    ],
 )
 def test_other_walls_are_refused(text):
-    with pytest.raises(InputError, match="--wall must be tube:INNER"):
+    with pytest.raises(InputError, match=r"--wall must be tube:INNER.*with FILLING as the --medium"):
         wall_of(text, 20.0)
 
 
 def test_a_hollow_is_smaller_than_its_wall():
     with pytest.raises(InputError, match="greater outer section"):
-        wall_of("tube:3e-5:2e-5:glass", 20.0)
+        wall_of("tube:3e-5:2e-5:glass:vacuum", 20.0)
 
 
 def test_a_reading_tells_the_wall(tmp_path):

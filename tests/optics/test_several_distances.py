@@ -12,6 +12,7 @@ from torch import Tensor
 from helpers.retrieval import BETA, DELTA, DOUBLE, PITCH, _squared_distance, at, exposures, pixels, taken
 from holosplat.geometry import Views
 from holosplat.optics.retrieval import RETRIEVALS
+from holosplat.optics.retrieval.contact import _moved
 from holosplat.optics.retrieval.model import WaveModel
 from holosplat.optics.retrieval.nonlinear import objective, penalty_weights
 from holosplat.optics.sampling import SharedPoses, alike
@@ -142,3 +143,45 @@ def test_a_frame_in_contact_helps_one_at_a_distance():
     each = [relative_error(RETRIEVALS["tikhonov"](frames[[v]], where[[v]], DELTA, beta), truth[[v]]) for v in range(2)]
     assert torch.allclose(both[0], both[1], atol=1e-4 * float(truth.max()))
     assert relative_error(both[:1], truth[:1]) < min(each)
+
+
+@pytest.mark.parametrize("name", list(RETRIEVALS))
+def test_frames_of_smaller_pixels_help_those_of_larger_ones(name):
+    """Each where it lies, and at its distance; those of the smallest pixels are as they are alone."""
+    sizes, shifts = PITCH * np.array([1.3, 1.0, 1.3]), PITCH * np.array([[0.0, 0.0], [1.3, -2.6], [-2.0, 1.0]])
+    views = Views.of_pixels(np.repeat(np.eye(3)[None], 3, axis=0), shifts, SHAPE, sizes)
+    where = replace(of_poses([0, 0, 9], [FAR, at(15.0), FAR]), views=views)
+    each = [replace(where[[n]], views=replace(views[[n]], pitch=float(sizes[n]), scales=None)) for n in range(3)]
+
+    def there(views: Views) -> Tensor:
+        x, y = pixels(views)
+        return bodies_at(x + views.shifts[0, 0], y + views.shifts[0, 1])
+
+    truth, frames = (torch.cat(parts) for parts in zip(*(taken(there, one) for one in each)))
+    frames, retrieve = noisy(frames, 1000.0).float(), RETRIEVALS[name]
+    alone = torch.cat([retrieve(frames[[n]], one, DELTA, BETA) for n, one in enumerate(each)])
+    found = retrieve(frames, where, DELTA, BETA)
+    assert relative_error(found[0], truth[0]) < 0.9 * relative_error(alone[0], truth[0])
+    for n in (1, 2):  # the last one has a pose of its own
+        torch.testing.assert_close(found[n], alone[n], rtol=1e-4, atol=1e-4 * float(truth.max()))
+
+
+@pytest.mark.parametrize("ratio", [1.0, 1.3, 2.0, 2.5])
+def test_a_frame_on_a_raster_of_larger_pixels_is_what_those_average(ratio):
+    """A Gaussian in closed form, whose variance grows by that of the larger pixels, beside rows that lack values."""
+    sigma, beside, (h, w) = 4.0, np.array([[1.4, -2.7]]), (41, 57)
+
+    def seen(step: float, variance: float, by: np.ndarray) -> Tensor:
+        y, x = ((torch.arange(n, dtype=DOUBLE) - (n - 1) / 2) * step + b for n, b in zip((h, w), by))
+        return sigma**2 / variance * torch.exp(-(y[:, None] ** 2 + x**2) / (2 * variance))[None]
+
+    found = _moved(seen(1.0, sigma**2, np.zeros(2)), beside, ratios=np.array([ratio]))
+    assert torch.allclose(found, seen(ratio, sigma**2 + (ratio**2 - 1) / 12, beside[0]), atol=2e-3)
+    gaps = torch.zeros(1, h, w, dtype=DOUBLE)
+    gaps[:, : h // 2] = 1
+    unseen = _moved(gaps, beside, 1.0, np.array([ratio])) > 0
+    y = (torch.arange(h, dtype=DOUBLE) - (h - 1) / 2) * ratio + beside[0, 0] + (h - 1) / 2
+    inside = (y >= h // 2 + ratio + 1) & (y <= h - 1)
+    assert unseen[0, ~((y >= h // 2) & (y <= h - 1))].all()
+    assert not unseen[0, inside, w // 2].any()
+    assert inside.any()

@@ -85,16 +85,23 @@ def test_the_sum_over_energies_converges_at_its_order(phase, monkeypatch):
         assert math.log2(errors[0] / errors[1]) == pytest.approx(2 * count, abs=0.5), count
 
 
-@pytest.mark.parametrize("width", [0.01, 0.03, 0.1, 0.3])
-def test_as_many_energies_are_taken_as_the_error_allows(width):
-    beams = exposures(width, 2, 8.0)
-    count = len(quadrature(beams)[0])
-    nodes, weights = np.polynomial.hermite.hermgauss(40)
-    a = math.pi * wavelength(ENERGY) * float(beams.distance.max()) / (2 * PITCH**2) * width / FWHM
-    exact = np.sum(weights * np.cos(math.sqrt(2) * a * nodes)) / np.sqrt(np.pi)
-    found, own = np.polynomial.hermite.hermgauss(count)
-    assert abs(np.sum(own * np.cos(math.sqrt(2) * a * found)) / np.sqrt(np.pi) - exact) <= QUADRATURE
-    assert np.sum(quadrature(beams)[1]) == pytest.approx(1)
+@pytest.mark.parametrize(
+    ("width", "distance", "most"),
+    [(0.01, 8.0, 2), (0.03, 8.0, 4), (0.1, 8.0, 5), (0.2, 30.0, 25), (0.1, 80.0, 25), (0.02, 400.0, 25)],
+)
+def test_as_many_energies_are_taken_as_the_error_allows(width, distance, most):
+    """For the finest fringe and all coarser ones, whether they are seen or washed out; against a fine sum."""
+    beams = exposures(width, 2, distance)
+    nodes, weights = quadrature(beams)
+    fine = np.linspace(-7, 7, 40_001)
+    normal = np.exp(-0.5 * fine**2)
+    finest = math.pi * wavelength(ENERGY) * float(beams.distance.max()) / (2 * PITCH**2)
+    for chi in finest * np.linspace(0, 1, 41):
+        exact = normal @ np.exp(1j * chi / (1 + width / FWHM * fine)) / normal.sum()
+        found = weights @ np.exp(1j * chi / (1 + width * nodes))
+        assert abs(found - exact) <= QUADRATURE
+    assert len(nodes) <= most
+    assert weights.sum() == pytest.approx(1)
 
 
 def test_the_sum_is_that_of_the_spectrums_own_energies():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import reduce
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import torch
 from scipy.optimize import isotonic_regression
 
 import holosplat as hs
+from holosplat.checks import InputError
 from holosplat.geometry import Grid
 from holosplat.inference import Decision
 from holosplat.matter import DeltaBeta, MaterialPrior, Matter
@@ -18,6 +20,7 @@ from holosplat.metrics import dice
 from holosplat.optics import NoiseModel
 from holosplat.optics.background import LightOptions
 from holosplat.representations import VoxelGrid
+from holosplat.tables import paths
 from holosplat.volume import Volume
 from holosplat.workflows import Reconstruction, RunFolder, certainty, rehearsal
 from holosplat.workflows.certainty import (
@@ -305,6 +308,23 @@ def test_every_mistake_has_a_command():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name", ["auto", "volume", "voxels", "surfaces"])
+def test_matter_beyond_the_field_is_tried_in_every_volume_of_a_method(name, few):
+    scan, method = few[1], METHODS[name]
+    _, how = MISTAKES["matter beyond the field"][1](scan, Again(PRIOR, method, 0, few[0]))
+    changed = paths_and_values(how["method"])
+    beside = {path for path in changed if path.endswith("volume.beside")}
+    assert len(beside) == (2 if name == "auto" else 1)
+    assert {path for path, value in paths_and_values(method).items() if changed[path] != value} == beside
+    assert {changed[path] for path in beside} == {0.5}
+    with pytest.raises(InputError, match="the method per-view has no matter beyond the field"):
+        MISTAKES["matter beyond the field"][1](scan, Again(PRIOR, METHODS["tikhonov-tv"], 0, few[0]))
+
+
+def paths_and_values(method):
+    return {path: reduce(getattr, path.split("."), method) for path in paths(method) if not path.endswith("kind")}
+
+
 def test_mistakes_are_found_on_held_out_frames_and_none_where_there_is_none(monkeypatch):
     scan, method = scan_of(12), METHODS["paganin-tv"]
     few = ("other sign of δ", "twice the angles", "matter beyond the field")

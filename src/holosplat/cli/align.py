@@ -145,7 +145,7 @@ def align(
     if not axis_only:
         tell_frames("align", measured.exposures, out, lambda seen: of_alignment(seen, how))
     measured = measured.in_memory()
-    prior = matter.prior(measured.exposures.reference_energy)
+    prior = matter.prior(measured.exposures.reference_energy, reading.told.wall)
     errors, frames, missing, lasting = None, measured.source, measured.missing, np.arange(len(measured))
     if axis_only:
         with ProgressBar() as bar:

@@ -161,7 +161,7 @@ def reconstruct(
         reading = replace(reading, part=replace(reading.part, time_frame=None))
     ways, folder = asked.ways(reading), RunFolder(out)
     measured = read_frames(scan, replace(reading, told=reading.told.at_middle()))
-    prior = asked.matter.without_ranges().prior(measured.exposures.reference_energy)
+    prior = asked.matter.without_ranges().prior(measured.exposures.reference_energy, reading.told.wall)
     measured = measured.in_memory() if can_be_seen(measured) else measured
     seen = measured.exposures[~measured.is_test]
     if isinstance(method, Pinn):
@@ -201,7 +201,7 @@ def _with_motion(scan: Path, out: Path, asked: Asked, reading: Reading, seed: in
             f"--motion auto goes on with what it has begun, but {out} was begun without it; name the --motion of that.",
         )
         measured = read_frames(scan, reading).in_memory()
-        prior = asked.matter.prior(measured.exposures.reference_energy)
+        prior = asked.matter.prior(measured.exposures.reference_energy, reading.told.wall)
         with interruptible(lambda: "interrupted before the motion was chosen"), ProgressBar() as bar:
             how = {"light": settings.light, "matter": settings.matter, "on_progress": bar.show}
             decision = choose_motion(measured, prior, settings.method, seed, **how)

@@ -344,8 +344,10 @@ class PriorOptions:
         require(not self.material or self.delta_beta is None, "give --material or --delta-beta, not both.")
         return replace(self, delta_beta=None) if self.ranges() else self
 
-    def prior(self, energy_kev: float) -> MaterialPrior:
-        """The prior at `energy_kev` [keV]. Errors: `InputError` for a range of δ/β."""
+    def prior(self, energy_kev: float, wall: str | None = None) -> MaterialPrior:
+        """The prior at `energy_kev` [keV], of what a `wall` encloses. Errors: `InputError` for a range of δ/β, and for
+        a medium that is not the filling of the wall."""
+        from ..materials import require_in_wall
         from ..matter import MaterialPrior
 
         require(not self.material or self.delta_beta is None, "give --material or --delta-beta, not both.")
@@ -360,8 +362,10 @@ class PriorOptions:
             free = MaterialPrior.unknown() if self.delta_beta is None else MaterialPrior.of_ratio(self.delta_beta)
             return self._sided(free)
         around = (self.medium, self.medium_density)
-        told = (MaterialOptions(*each, *around).filling().of("", energy_kev) for each in self._with_densities())
-        return self._sided(MaterialPrior.known(*told, medium=self.medium or ""))
+        told = [MaterialOptions(*each, *around).filling() for each in self._with_densities()]
+        if wall is not None:
+            require_in_wall(wall, told[0].medium)
+        return self._sided(MaterialPrior.known(*(each.of("", energy_kev) for each in told), medium=self.medium or ""))
 
     def _sided(self, prior: MaterialPrior) -> MaterialPrior:
         """The prior with what `contrast` says."""

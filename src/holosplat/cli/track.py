@@ -163,7 +163,7 @@ def track(
             "note: two beams leave the shapes of bodies open; where their shape at rest is known, --body red-cell or "
             "--body FILE helps."
         )
-    prior = matter.prior(measured.exposures.reference_energy)
+    prior = matter.prior(measured.exposures.reference_energy, reading.told.wall)
     with interruptible(lambda: _cut_off(folder)), ProgressBar() as bar:
         told = {"light": illumination.options(), "folder": folder, "resume": resume, "on_progress": bar.show}
         result = follow(measured, prior, options, seed, **told)

@@ -29,6 +29,7 @@ class Auto(Method):
     mixes_kinds: ClassVar[bool] = True
     """A volume may take the place of bodies."""
     two_sided: ClassVar[bool] = True
+    several: ClassVar[bool] = True
 
     gaussians: Gaussians = field(default_factory=Gaussians)
     surfaces: SurfaceOptions = field(default_factory=SurfaceOptions)
@@ -62,6 +63,7 @@ class Bodies(Method):
     """Gaussians, and surfaces where these enclose bodies of one material."""
 
     kind: ClassVar[str] = "bodies"
+    several: ClassVar[bool] = True
     cones: ClassVar[bool] = True
     mixes_kinds: ClassVar[bool] = True
 

@@ -47,6 +47,7 @@ class Continued(Method):
     kind: ClassVar[str] = "continued"
     """It was decided by the run that it goes on from."""
     two_sided: ClassVar[bool] = True
+    several: ClassVar[bool] = True
 
     begin: Path
     """The object file that it begins with (object.h5)."""

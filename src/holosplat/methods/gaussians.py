@@ -58,6 +58,7 @@ class Gaussians(GaussianOptions, Method):
     cones: ClassVar[bool] = True
     any_backend: ClassVar[bool] = True
     two_sided: ClassVar[bool] = True
+    several: ClassVar[bool] = True
 
     def stages(self) -> tuple[Stage, ...]:
         """One: the start, and the fit."""

@@ -112,7 +112,7 @@ def prepared(task: Task, method: Method | None = None, before: Prepared | None =
     Frames that were divided by light before stay as they are: what that left open (`Scan.light`) is then what is not
     known of it. A pattern that is an unknown of the `method` itself is not looked for. Of several times the middle one
     decides for all. Errors: those of `Light.of`, and `InputError` for matter on both sides of its medium, where the
-    method has none.
+    method has none, and for several materials where it has the level of one.
     """
     if task.lit is not None:
         return task
@@ -121,6 +121,11 @@ def prepared(task: Task, method: Method | None = None, before: Prepared | None =
             method.two_sided or not task.prior.two_sided,
             f"matter on both sides of its medium is continuous, but the method is {method.kind}, whose matter lies on "
             "one; take --method auto or volume.",
+        )
+        require(
+            method.several or len(task.prior.materials) < 2,
+            f"--material must be given once for the method {method.kind}, whose matter has one level, but it is given "
+            f"{len(task.prior.materials)} times; give one, or take --method auto, gaussians, surfaces or volume.",
         )
         require(
             task.prior.two_sided or not _volume_of(method).two_sided,

@@ -197,6 +197,7 @@ class Method(Protocol):
     any_backend: whether GPUs can compute it, too
     likelier: whether fits are likelier than their starts by noise and prior; frames alone prefer what fits their noise
     two_sided: whether its matter may lie on both sides of its medium
+    several: whether it has the levels of several known materials
     cones: whether rays may be those of cones
     """
 
@@ -206,6 +207,7 @@ class Method(Protocol):
     any_backend: ClassVar[bool] = False
     likelier: ClassVar[bool] = False
     two_sided: ClassVar[bool] = False
+    several: ClassVar[bool] = False
     cones: ClassVar[bool] = False
 
     @property

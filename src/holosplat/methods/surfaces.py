@@ -49,6 +49,7 @@ class Surfaces(SurfaceOptions, Method):
 
     kind: ClassVar[str] = "surfaces"
     cones: ClassVar[bool] = True
+    several: ClassVar[bool] = True
     any_backend: ClassVar[bool] = True
 
     gaussians: Gaussians = field(default_factory=Gaussians)

@@ -12,6 +12,7 @@ import numpy as np
 from ..baselines.material import LIKELY_RATIOS
 from ..checks import InputError, require
 from ..matter import DeltaBeta, Known, KnownRatio, KnownSeveral, MaterialPrior
+from ..optics.coherence import quadrature
 from ..ranges import checked_dataclass
 from ..scan import Scan
 from .method import Task, first_of_task, shows_no_refraction
@@ -126,6 +127,8 @@ def determine(task: Task, uncertain: Uncertain, options: ProfileOptions | None =
         return _untold(ranges, middle, "the frames show absorption alone")
     corners = [dict(zip(ranges, ends)) for ends in zip(*map(_sorted, ranges.values()))]
     corners += [corner | {"distance": longest} for corner in corners if longest]
+    for corner in corners:
+        quadrature(exposed(task.scan, corner).exposures)  # which says what no fit can sum
     ratio, start = _assumed_ratio(task, middle), {}
     if uncertain.delta_beta:
         low, high = _sorted(uncertain.delta_beta)

@@ -50,6 +50,7 @@ class SmoothVolume(Method):
     cones: ClassVar[bool] = True
     likelier: ClassVar[bool] = True
     two_sided: ClassVar[bool] = True
+    several: ClassVar[bool] = True
 
     volume: HolographicTV = field(default_factory=_start)
     """The start: phase retrieval, total variation, and agreement with the frames. With fewer rounds of agreement than

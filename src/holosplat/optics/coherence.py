@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import numpy as np
 
@@ -17,6 +18,9 @@ FWHM = 2 * math.sqrt(2 * math.log(2))
 """Full width at half maximum of a Gaussian of standard deviation 1."""
 QUADRATURE = 1e-3
 """Error of the contrast of the finest fringes, as a share of it, that a sum over energies may have."""
+TAILS, ALIASED = -NormalDist().inv_cdf(QUADRATURE / 8), math.sqrt(-2 * math.log(QUADRATURE / 2))
+"""Standard deviations beyond which a normal distribution has a quarter of `QUADRATURE`, and where `exp(-x²/2)` is half
+of it: together they err by that much, as what is left out counts twice."""
 MOST_ENERGIES = 32
 """Energies of a spectrum in a fit at most: each costs the waves of a frame."""
 
@@ -68,26 +72,38 @@ class Spectrum:
 def quadrature(exposures: Exposures) -> tuple[np.ndarray, np.ndarray]:
     """Nodes [E] and weights [E] of a sum over the energies `E₀ (1 + node · bandwidth)` of the light of all frames.
 
-    Of Gauss–Hermite quadrature (Abramowitz & Stegun 1964, eq. 25.4.46), as few as err by `QUADRATURE` at most. Fringes
-    of the frequency f vary with the energy as cos(χE₀/E), χ = πλz f². Over a Gaussian of relative standard deviation σ
-    the remainder of n nodes is `(χσ)²ⁿ n!/(2n)!` at most, χ that of the corner of the detector's spectrum. One node of
-    weight 1 where all frames have one energy. Errors: `InputError` where more than `MOST_ENERGIES` would be needed.
+    Fringes of the frequency f vary with the energy as cos(χE₀/E), χ = πλz f², by χσ over a Gaussian of relative
+    standard deviation σ; χ is taken at the corner of the detector's spectrum. The rule of fewer energies is taken:
+
+    - Gauss–Hermite quadrature (Abramowitz & Stegun 1964, eq. 25.4.46), whose remainder of n nodes is `(χσ)²ⁿ n!/(2n)!`
+      at most, so that n grows as (χσ)²;
+    - equal steps h over ±Sσ, with `exp(-(2π/h - a)²/2)` at most, a being the most that a fringe varies by there,
+      `χσ/(1 - Sσ)²`, besides what lies beyond (Trefethen & Weideman 2014, SIAM Rev. 56, 385, theorem 5.1, on a line
+      that is moved by 2π/h - a); n grows as χσ. It needs fewer where the bandwidth washes fringes out.
+
+    Both err by `QUADRATURE` at most; the first one where χE₀/E is as good as linear in the energy. One node of weight 1
+    where all frames have one energy. Errors: `InputError` where more than `MOST_ENERGIES` would be needed.
     """
     optics = exposures.optical
     reach = wavelength(optics.energy_kev) * np.abs(optics.distance)
+    wide = float(np.max(optics.bandwidth, initial=0.0)) / FWHM
     worst = float(np.max(math.pi * reach / (2 * optics.views.pitch**2) * optics.bandwidth / FWHM, initial=0.0))
     count, error = 1, worst**2 / 2
     while error > QUADRATURE and count <= MOST_ENERGIES:
         count += 1
         error *= worst**2 / (2 * (2 * count - 1))
-    least = 1 - math.sqrt(4 * count + 2) * float(np.max(optics.bandwidth, initial=0.0)) / FWHM
+    even = math.ceil(TAILS / math.pi * (worst / (1 - TAILS * wide) ** 2 + ALIASED))
+    if count <= min(even, MOST_ENERGIES) and math.sqrt(4 * count + 2) * wide < 1:
+        nodes, weights = np.polynomial.hermite.hermgauss(count)
+        return math.sqrt(2) / FWHM * nodes, weights / weights.sum()
     require(
-        count <= MOST_ENERGIES and least > 0,
-        f"a bandwidth of {float(np.max(optics.bandwidth)):g} washes out the finest fringes of these pixels and "
-        f"distances, which takes more than {MOST_ENERGIES} energies, or such below 0; bin the frames (--bin).",
+        even <= MOST_ENERGIES,
+        f"a bandwidth of {wide * FWHM:g} washes out the finest fringes of these pixels and distances, which takes "
+        f"more than {MOST_ENERGIES} energies ({even}); bin the frames (--bin), or give a narrower --bandwidth.",
     )
-    nodes, weights = np.polynomial.hermite.hermgauss(count)
-    return math.sqrt(2) / FWHM * nodes, weights / weights.sum()
+    nodes = TAILS * (2 * np.arange(even) + 1 - even) / even
+    weights = np.exp(-0.5 * nodes**2)
+    return nodes / FWHM, weights / weights.sum()
 
 
 def source_blur(source_size: float, source_distance: float, distance: float | np.ndarray) -> np.ndarray:

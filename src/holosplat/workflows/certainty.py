@@ -27,7 +27,7 @@ from ..optics.background import LightOptions
 from ..progress import Progress
 from ..rotations import angles_about_y
 from ..scan import Scan, interleaved_split
-from ..tables import overridden, read_table
+from ..tables import overridden, paths, read_table
 from ..volume import Volume
 from .evaluate import of_absorption
 from .next_step import STIFF
@@ -187,7 +187,10 @@ def _about(value: float) -> tuple[float, float]:
 
 
 def _beyond(scan: Scan, again: Again) -> tuple[Scan, Mapping[str, Any]]:
-    return scan, {"method": overridden(again.method, ["volume.beside=0.5"])}
+    """In every volume of the method: `Auto` has one for each kind of matter."""
+    places = [path for path in paths(again.method) if path.endswith("volume.beside")]
+    require(len(places) > 0, f"the method {again.method.kind} has no matter beyond the field.")
+    return scan, {"method": overridden(again.method, [f"{path}=0.5" for path in places])}
 
 
 def _steps(turn: float) -> Change:

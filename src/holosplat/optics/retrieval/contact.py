@@ -6,9 +6,12 @@ Behind matter of thickness T the intensity is then `exp(-2 k β T)` (docs/conven
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial, wraps
+from inspect import signature
+from itertools import product
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -23,7 +26,7 @@ from ...units import wavenumber
 from ..hologram import hologram, optical_path
 from ..noise import noise_levels, with_gaps
 from ..sampling import SharedPoses, alike, fringe_sampling, padding
-from .spectra import checked, column, finest_phase
+from .spectra import checked, column, finest_phase, part_of
 
 UNSEEN = 0.01
 """Refraction that changes the contrast of the finest detail by less than this share of its absorption is not seen."""
@@ -43,15 +46,26 @@ def _apart_px(exposures: Exposures, poses: SharedPoses) -> np.ndarray:
     return np.where(np.abs(apart) > np.finfo(np.float32).eps * max(exposures.views.shape), apart, 0.0)
 
 
-def _moved(images: Tensor, pixels: np.ndarray, beyond: float | None = None) -> Tensor:
-    """Images [V, H, W] on rasters that lie `pixels` [V, 2] further along rows and columns, by cubic splines; beyond:
-    the value outside (default: that of the edge)."""
+def _moved(images: Tensor, pixels: np.ndarray, beyond: float | None = None, ratios: np.ndarray | None = None) -> Tensor:
+    """Images [V, H, W] on rasters that lie `pixels` [V, 2] of theirs further along rows and columns, by cubic splines,
+    and whose pixels are `ratios` [V] ≥ 1 times as large; beyond: the value outside (default: that of the edge).
+
+    A larger pixel is the mean of evenly spaced samples by which the variance of their places grows as by its width,
+    from s²/12 to (ratio s)²/12: for whole ratios, of the pixels within it.
+    """
     found = images.clone()
-    mode, value = ("nearest", 0.0) if beyond is None else ("constant", beyond)
-    for n in np.flatnonzero(pixels.any(axis=1)):
-        order = 3 if beyond is None else 1
-        image = ndimage.shift(images[n].double().cpu().numpy(), -pixels[n], order=order, mode=mode, cval=value)
-        found[n] = torch.from_numpy(image).to(images)
+    ratios = np.ones(len(images)) if ratios is None else ratios
+    order, mode, value = (3, "nearest", 0.0) if beyond is None else (1, "constant", beyond)
+    for n in np.flatnonzero(pixels.any(axis=1) | (ratios != 1)):
+        image, ratio = images[n].double().cpu().numpy(), float(ratios[n])
+        count = math.ceil(ratio)
+        around = math.sqrt((ratio**2 - 1) / max(count**2 - 1, 1)) * (np.arange(count) - 0.5 * (count - 1))
+        first = pixels[n] + 0.5 * (1 - ratio) * (np.array(image.shape) - 1)
+        samples = (
+            ndimage.affine_transform(image, [ratio, ratio], first + at, order=order, mode=mode, cval=value)
+            for at in product(around, around)
+        )
+        found[n] = torch.from_numpy(sum(samples) / count**2).to(images)
     return found
 
 
@@ -176,9 +190,42 @@ def _in_bands(
     return found
 
 
+def _on_each_raster(
+    method: Callable[..., Tensor], frames: Tensor, exposures: Exposures, missing: Tensor | None, options: Any
+) -> Tensor:
+    """What `method` retrieves of frames [V, H, W] whose pixels differ: of those of each size on their own raster, with
+    the frames of their poses that have smaller pixels brought there, at the distances that these have.
+
+    Larger pixels do not tell what smaller ones resolve, so that those have no part in them.
+    """
+    views, sizes = exposures.views, exposures.views.pixel_sizes
+    of = SharedPoses(replace(exposures, views=replace(views, scales=None))).of
+    gaps = torch.zeros(frames.shape, dtype=torch.bool) if missing is None else missing
+    found = torch.empty_like(frames)
+    for size in np.unique(sizes):
+        own = sizes == size
+        which = np.concatenate((np.flatnonzero(own), np.flatnonzero((sizes < size) & np.isin(of, of[own]))))
+        ratios, part = size / sizes[which], exposures[which]
+        shifts = views.shifts[[v if own[v] else np.flatnonzero(own & (of == of[v]))[0] for v in which]]
+        apart = (shifts - views.shifts[which])[:, ::-1] / sizes[which, None]
+        unseen = _moved(gaps[which].double(), apart, 1.0, ratios) > 0
+        there = replace(part.views, pitch=float(size), scales=None, shifts=shifts)
+        told = replace(options, noise=part_of(options.noise, which))
+        lines = method(
+            _moved(frames[which], apart, ratios=ratios),
+            replace(part, views=there, psf_sigma_px=part.psf_sigma_px / ratios),
+            missing=unseen if unseen.any() else None,
+            options=told,
+        )
+        found[own] = lines[: own.sum()]
+    return found
+
+
 def or_in_contact(method: Method) -> Method:
     """`method` for the views that show refraction, and `contact_thickness` for those that show absorption alone; beside
     a wall that is known, for frames as if without it (`without_wall`)."""
+
+    usual = signature(method).parameters["options"].default
 
     @wraps(method)
     def retrieve(
@@ -193,8 +240,13 @@ def or_in_contact(method: Method) -> Method:
         if exposures.wall is not None:
             alone = partial(retrieve, delta=delta, beta=beta, missing=missing, **options)
             return without_wall(alone, frames, exposures, (delta, beta))
-        exposures = exposures.optical
         checked(frames, exposures, delta)
+        flat = replace(exposures, views=replace(exposures.views, scales=None))
+        if not exposures.views.has_one_pixel and (SharedPoses(flat).any or SharedPoses(exposures.optical).any):
+            how = {"options": usual} | options
+            one = partial(retrieve, delta=delta, beta=beta, **{name: how[name] for name in how if name != "options"})
+            return _on_each_raster(one, frames, exposures, missing, how["options"])
+        exposures = exposures.optical
         poses, bands = SharedPoses(exposures), _bands(missing, frames.shape[1])
         if missing is not None and not poses.any and (bands[:, 1] - bands[:, 0] < frames.shape[1]).any():
             return _in_bands(partial(retrieve, delta=delta, beta=beta, **options), frames, exposures, missing, bands)
