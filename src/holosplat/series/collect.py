@@ -16,8 +16,10 @@ from ..io.objects import read_object
 from ..tables import number_in
 from ..workflows.motion_choice import begun_motion
 from ..workflows.run_folder import RunFolder
-from .events import EVENT_COLUMNS, FRONT_COLUMNS, PARTS, TRACK_COLUMNS, Front, History, Parts, front_rows
+from ..workflows.totals import TotalMatter
+from .events import EVENT_COLUMNS, PARTS, TRACK_COLUMNS, History, Parts
 from .folder import Body, Row, SeriesFolder, TaskState, plain, time_left
+from .fronts import FRONT_COLUMNS, Front, front_rows
 from .one_time import PHASE
 from .plan import Moment, SeriesPlan
 
@@ -160,9 +162,11 @@ def collect(folder: SeriesFolder, fronts: bool = False) -> Collected:
 def _front(run: Path) -> Front:
     """Of the object that a run found, on voxels of the pixels."""
     folder = RunFolder(run)
-    seen = folder.read_summary()["detector"]
+    summary = folder.read_summary()
+    seen, total = summary["detector"], summary.get("total")
     grid = Grid.centred((seen["columns"], seen["rows"], seen["columns"]), seen["pixel_size_m"])
-    return Front.of(read_object(folder.object).voxelise(grid))
+    told = TotalMatter.from_dict(total).profile if total else None
+    return Front.of(read_object(folder.object).voxelise(grid), told)
 
 
 def _lines(folder: SeriesFolder, found: Collected) -> Iterable[list[object]]:
