@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import csv
+import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from helpers.cli import holosplat, worked
 from holosplat.checks import InputError
 from holosplat.geometry import Grid
+from holosplat.inference import Decision
 from holosplat.matter import Matter
+from holosplat.methods.contrast import BOTH, STAGE
 from holosplat.representations import VoxelGrid
 from holosplat.series.collect import collect
 from holosplat.series.events import PARTS, History, Parts
-from holosplat.series.folder import SeriesFolder
+from holosplat.series.folder import SeriesFolder, read_row, write_row
+from holosplat.series.one_time import Before, is_without_bodies
+from holosplat.workflows.run_folder import RunFolder
 
 GRID = Grid.centred((31, 25, 37), 0.5e-6, (1e-6, 0.0, 0.0))
 DELTA = 4e-7
@@ -101,3 +108,22 @@ def test_a_series_writes_its_events(done, tmp_path):
         ("appearance", "1.5", "2"),
     ]
     assert "disappearance between 1 and 1.5 s" in folder.page.read_text()
+
+
+def test_continuous_matter_on_both_sides_has_no_events(done, tmp_path):
+    """A shock of five times had twenty. Its fronts are told all the same."""
+    shutil.copytree(done.path, tmp_path / "series")
+    folder = SeriesFolder(tmp_path / "series")
+    for number in range(5):
+        run = RunFolder(folder.run(number // 2, number))
+        summary = {**run.read_summary(), "decisions": [Decision(STAGE, BOTH, "views set aside").as_dict()]}
+        run.summary.write_text(json.dumps(summary))
+        write_row(folder.row(number // 2, number), replace(read_row(folder.row(number // 2, number)), kind="voxels"))
+    found = collect(folder, fronts=True)
+    assert found.no_events.startswith("5 of 5 times have no events of bodies: continuous matter on both sides")
+    assert len(folder.events.read_text().splitlines()) == len(folder.tracks.read_text().splitlines()) == 1
+    assert len(folder.fronts.read_text().splitlines()) == 6
+    assert found.no_events in folder.page.read_text()
+    assert found.no_events in worked(holosplat("series", "collect", folder.path)).err
+    assert is_without_bodies(Before(run, replace(read_row(folder.row(2, 4)), kind="voxels")))
+    assert not is_without_bodies(Before(run, replace(read_row(folder.row(2, 4)), kind="surfaces")))

@@ -26,7 +26,7 @@ from ..methods.illumination import prepared
 from ..methods.keeper import NAME, Keeper
 from ..methods.trials import decide_kind
 from ..progress import FitProgress, FitState
-from ..representations import Stored, SurfaceMesh
+from ..representations import Stored, SurfaceMesh, VoxelGrid
 from ..scan import Scan
 from ..units import wavenumber
 from ..workflows.evaluate import Evaluation, evaluate, render
@@ -199,6 +199,15 @@ def is_spherical(own: Before) -> bool:
     return _known(own).spherical
 
 
+def is_without_bodies(own: Before) -> bool:
+    """Whether a finished time is of continuous matter on both sides of its medium, or of spherical matter: it fills the
+    field, and parts above half of its material's δ, which is that of a voxel somewhere, are no bodies."""
+    if own.row.kind != VoxelGrid.kind:
+        return False
+    known = _known(own)
+    return known.two_sided or known.spherical
+
+
 def _left(done: Reconstruction, scan: Scan) -> Score:
     """The score of a result on the training frames of `scan`."""
     train = done.placed(scan).train()
@@ -300,7 +309,7 @@ def _written(shot: Shot, settings: Settings, folder: RunFolder, done: Reconstruc
         scan = done.placed(shot.scan)
         evaluation = evaluate(done, scan, None)
         write_phase(folder.path / PHASE, done.object, scan)
-        if done.object.matter.delta:
+        if done.object.matter.delta and not is_without_bodies(Before(folder, filled(row, done, evaluation))):
             Parts.of(done.object, Grid.of_views(scan.views)).write(folder.path / PARTS)
         if not (folder.path / REFERENCE).is_file():
             _keep(folder, _left(done, shot.scan).powers)
