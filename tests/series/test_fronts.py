@@ -127,6 +127,7 @@ def test_errors_of_a_shock_in_frames_cover_the_truth():
         scan = hs.simulate(scene, exposures, photons_per_pixel=3000.0, seed=number, is_test=none)
         light = LightOptions("even", still="none", noise="white")
         done = hs.reconstruct(scan, prior.on_both_sides().about_a_point(), SmoothVolume(), light=light)
+        assert done.total is not None
         told = TotalMatter.from_dict(done.total.as_dict()).profile
         assert told is not None
         grid = Grid.of_views(views)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from types import SimpleNamespace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -26,6 +26,7 @@ from holosplat.series.one_time import Before, Shot, reconstruct_time
 from holosplat.series.plan import Settings
 from holosplat.specimens import ExpandingShock, Substances
 from holosplat.specimens.phantoms import Ball
+from holosplat.workflows.reconstruct import load_reconstruction
 from holosplat.workflows.run_folder import RunFolder
 
 
@@ -53,7 +54,7 @@ def test_a_warm_time_is_told_the_sides_that_the_one_before_decided(sides, done, 
     assert priors[0].spherical == (sides == SPHERICAL)
 
 
-def test_a_warm_sphere_is_not_thrown_away_for_cold_surfaces(monkeypatch):
+def test_a_warm_sphere_is_not_thrown_away_for_cold_surfaces(done, tmp_path, monkeypatch):
     """In one view, whose short run makes one kind alone: training frames are surely for the sphere. It is told what is
     known of the sphere, not what was before the sides were decided."""
     water = parse_material("water").delta_beta(20.0)
@@ -76,9 +77,11 @@ def test_a_warm_sphere_is_not_thrown_away_for_cold_surfaces(monkeypatch):
 
     monkeypatch.setattr(one_time, "decide_kind", told)
     below = Decision(STAGE, BELOW, "data fission").as_dict()
-    by = SimpleNamespace(read_config=lambda: {"decided": {"light": [], "decisions": [below]}})
-    found = {name: SimpleNamespace(object=one, oversample=1) for name, one in (("warm", sphere), ("cold", cold))}
-    shot = Shot(scan, MaterialPrior.of_ratio(water.ratio), {}, None)
+    by = RunFolder(tmp_path)
+    by.config.write_text(json.dumps({"decided": {"light": [], "decisions": [below]}}))
+    run = load_reconstruction(RunFolder(done.run(0, 0)))
+    found = {"warm": replace(run, object=sphere, oversample=1), "cold": replace(run, object=cold, oversample=1)}
+    shot = Shot(scan, MaterialPrior.of_ratio(water.ratio), {}, read_row(done.row(0, 0)))
     settings = Settings(light=LightOptions("even", still="none", noise="white"))
     decision = one_time._better(shot, known_of, settings, found, by)
     assert decision.choice == "warm"

@@ -47,10 +47,10 @@ class Front:
         """The spherical front that runs from the middle of the matter.
 
         The radial mean shows where; then centre, radius, width, step and level before it are fitted to the voxels of a
-        shell by least squares, out of which what lies deeper than `BEHIND` is left: there δ falls off.
+        shell by least squares. The shell ends `BEHIND` the front, since δ falls off deeper.
 
-        told: what frames tell of matter that is spherical by construction, and linear between radii, so that the width
-        is known; its covariance goes through the slopes of the fitted numbers. Else eighths of the directions left out
+        told: errors of matter that is spherical by construction, and linear between radii, so that the width is known;
+        its covariance goes through the slopes of the fitted numbers. Else eighths of the directions left out
         in turn (jackknife) give the errors, since errors of neighbouring voxels go together. That δ falls off behind
         the front shifts the radius by the square of the depth that is fitted. A fit that goes `DEEPER` tells by how
         much (Richardson 1911); that is taken off, and added to the error of the radius, as is what `PLACED` says.
@@ -119,8 +119,8 @@ def _jump(places: np.ndarray, values: np.ndarray) -> float:
     return float(radii[(explained / (whole + MARGIN * uneven(0, end) + 1e-30)).argmax()])
 
 
-def _half_shell(radius: np.ndarray | float) -> np.ndarray:
-    return np.maximum(SHELL * radius, THINNEST)
+def _half_shell(radius: float) -> float:
+    return max(SHELL * radius, THINNEST)
 
 
 def _design(places: np.ndarray, numbers: np.ndarray) -> np.ndarray:

@@ -238,7 +238,7 @@ def _better(
     shot: Shot, prior: MaterialPrior, settings: Settings, found: Mapping[str, Reconstruction], by: RunFolder
 ) -> Decision:
     """The better one of two results, the null last: by the policy of a run's states (`Keeper`), in the light that
-    the run `by` decided for; prior: what is known of the one that goes on from another time, with its sides."""
+    the run `by` decided for; prior: of the result that goes on from another time, with its sides."""
     task = Task(shot.scan.train(), prior, settings.seed, light=settings.light)
     taken, _ = decided_before(by.read_config()["decided"])
     task = prepared(task, settings.method, (taken, ()))
