@@ -12,7 +12,7 @@ from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import Auto, Task
 from holosplat.methods.cross_validation import BY_VIEWS
 from holosplat.methods.trials import decide_kind, unseen_kinds
-from holosplat.representations import GaussianCloud, SurfaceMesh
+from holosplat.representations import GaussianCloud, SurfaceMesh, VoxelGrid
 from holosplat.scan import Exposures
 from holosplat.specimens.red_cells import random_cells
 from holosplat.specimens.scene import MeshScene
@@ -34,6 +34,7 @@ def sharp() -> Task:
 
 def test_sharp_bodies_are_surfaces(sharp):
     found = decide_kind(sharp, BODIES, SurfaceMesh.kind, GaussianCloud.kind)
+    assert found is not None
     assert (found.choice, found.by) == (SurfaceMesh.kind, BY_VIEWS)
     assert not found.compared[0].wins
 
@@ -41,7 +42,14 @@ def test_sharp_bodies_are_surfaces(sharp):
 def test_soft_bodies_are_gaussians():
     soft = Task(two_cells(6), MaterialPrior.known(MATERIAL))
     found = decide_kind(soft, BODIES, SurfaceMesh.kind, GaussianCloud.kind)
+    assert found is not None
     assert found.choice == GaussianCloud.kind
+
+
+def test_a_kind_that_the_short_run_does_not_make_is_not_compared(sharp):
+    """It was given the other's score: a gain of exactly 0, with which the null won."""
+    for null, other in ((SurfaceMesh.kind, VoxelGrid.kind), (VoxelGrid.kind, SurfaceMesh.kind)):
+        assert decide_kind(sharp, Auto().volume.with_effort(0.3), null, other) is None
 
 
 def test_which_runs_have_a_choice_of_kinds(sharp):

@@ -80,11 +80,11 @@ def test_a_total_that_is_told_counts_by_its_error(scan, shock):
         while not sphere.ended:
             sphere.step()
         sums.append(float(sphere.volume().double().sum()))
-    error = Sphere(whitened, truth).error_of_sum
+    error = Sphere(whitened, truth).errors()[0]
     assert sums[1] == pytest.approx(sums[0], abs=0.05 * error)
     assert sums[2] == pytest.approx(300.0, abs=0.1)
     assert abs(sums[0] - float(truth.double().sum())) < 4 * error
-    assert error > 50 > 10 * Sphere(whitened, truth, told=(300.0, 5.0)).error_of_sum / 2
+    assert error > 50 > 10 * Sphere(whitened, truth, told=(300.0, 5.0)).errors()[0] / 2
 
 
 def test_a_total_is_told_of_spherical_matter_alone(scan):

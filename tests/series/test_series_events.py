@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import csv
+import json
 import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from helpers.cli import holosplat, worked
 from holosplat.checks import InputError
 from holosplat.geometry import Grid
-from holosplat.materials import parse_material
+from holosplat.inference import Decision
 from holosplat.matter import Matter
+from holosplat.methods.contrast import BOTH, STAGE
 from holosplat.representations import VoxelGrid
 from holosplat.series.collect import collect
-from holosplat.series.events import FRONT_COLUMNS, PARTS, Front, History, Parts, front_rows
-from holosplat.series.folder import SeriesFolder
-from holosplat.specimens import ExpandingShock, Substances
-from holosplat.volume import Volume
+from holosplat.series.events import PARTS, History, Parts
+from holosplat.series.folder import SeriesFolder, read_row, write_row
+from holosplat.series.one_time import Before, is_without_bodies
+from holosplat.workflows.run_folder import RunFolder
 
 GRID = Grid.centred((31, 25, 37), 0.5e-6, (1e-6, 0.0, 0.0))
 DELTA = 4e-7
@@ -107,50 +110,20 @@ def test_a_series_writes_its_events(done, tmp_path):
     assert "disappearance between 1 and 1.5 s" in folder.page.read_text()
 
 
-def shock(radius: float, noise: float = 0.0) -> Volume:
-    """A front of that many voxels about (1, -2, 0.5), compressed behind it, rarefied in the middle, in noise."""
-    z, y, x = np.meshgrid(*(np.arange(n) - 0.5 * (n - 1) for n in GRID.shape), indexing="ij")
-    away = np.sqrt((x - 1) ** 2 + (y + 2) ** 2 + (z - 0.5) ** 2)
-    values = np.clip(radius - away + 0.5, 0, 1) * (1 - 0.12 * (radius - away)) - 3 * (away < 2.5)
-    values = values + noise * np.random.default_rng(0).normal(size=values.shape)
-    return Volume(DELTA * values, 0 * values, GRID)
-
-
-def test_a_front_is_found_with_radius_step_and_errors():
-    """To a tenth of a voxel, in noise of a fifth of its step, beside a stronger jump in its middle."""
-    found = Front.of(shock(8.3, noise=0.2))
-    assert found.radius == pytest.approx(8.3 * 0.5e-6, abs=0.1 * 0.5e-6)
-    assert found.step == pytest.approx(DELTA, rel=0.1)
-    middle = np.array(GRID.origin) + 0.5e-6 * (0.5 * (np.array(GRID.shape[::-1]) - 1) + [1, -2, 0.5])
-    assert found.centre == pytest.approx(middle, abs=0.1 * 0.5e-6)
-    assert 0 < found.errors[3] < 0.1 * 0.5e-6
-    assert abs(found.radius - 8.3 * 0.5e-6) < 4 * found.errors[3]
-    with pytest.raises(InputError, match="a front needs matter"):
-        Front.of(Volume(np.zeros(GRID.shape), np.zeros(GRID.shape), GRID))
-
-
-@pytest.mark.parametrize("share", [0.0, 0.5], ids=["thin", "thicker"])
-def test_the_front_of_a_thin_shell_is_not_drawn_inside(share):
-    """What a young shock compresses is thinner than the fitted shell, and falls off in a curve behind the front."""
-    water, grid = parse_material("water").delta_beta(20.0), Grid.centred((44, 45, 46), 1e-6)
-    kind = ExpandingShock(44e-6)
-    found = Front.of(kind.drawn(Substances(water, medium=water), 1).scene.at(share).voxelise(grid))
-    assert found.radius == pytest.approx(kind.radius(share), abs=0.1e-6)
-
-
-def test_what_hardly_anything_is_far_out_is_no_front():
-    """A shell of a thousandth of the step, beyond which there is nothing at all."""
-    faint = shock(8.3)
-    z, y, x = np.meshgrid(*(np.arange(n) - 0.5 * (n - 1) for n in GRID.shape), indexing="ij")
-    shell = np.abs(np.sqrt((x - 1) ** 2 + (y + 2) ** 2 + (z - 0.5) ** 2) - 12) < 0.5
-    found = Front.of(replace(faint, delta=faint.delta + 1e-3 * DELTA * shell))
-    assert found.radius == pytest.approx(8.3 * 0.5e-6, abs=0.1 * 0.5e-6)
-
-
-def test_a_front_runs_at_a_speed_with_its_error():
-    radii, times = [6.0, 6.8, 7.6, 8.4, 9.2, 10.0], 1e-6 * np.arange(6)
-    rows = list(front_rows(range(6), times.tolist(), [Front.of(shock(radius, noise=0.05)) for radius in radii]))
-    assert len(rows[0]) == len(FRONT_COLUMNS)
-    for row in rows:
-        assert float(str(row[9])) == pytest.approx(0.4, abs=0.03)  # 0.8 voxels of 0.5 µm a µs
-        assert 0 < float(str(row[10])) < 0.03
+def test_continuous_matter_on_both_sides_has_no_events(done, tmp_path):
+    """A shock of five times had twenty. Its fronts are told all the same."""
+    shutil.copytree(done.path, tmp_path / "series")
+    folder = SeriesFolder(tmp_path / "series")
+    for number in range(5):
+        run = RunFolder(folder.run(number // 2, number))
+        summary = {**run.read_summary(), "decisions": [Decision(STAGE, BOTH, "views set aside").as_dict()]}
+        run.summary.write_text(json.dumps(summary))
+        write_row(folder.row(number // 2, number), replace(read_row(folder.row(number // 2, number)), kind="voxels"))
+    found = collect(folder, fronts=True)
+    assert found.no_events.startswith("5 of 5 times have no events of bodies: continuous matter on both sides")
+    assert len(folder.events.read_text().splitlines()) == len(folder.tracks.read_text().splitlines()) == 1
+    assert len(folder.fronts.read_text().splitlines()) == 6
+    assert found.no_events in folder.page.read_text()
+    assert found.no_events in worked(holosplat("series", "collect", folder.path)).err
+    assert is_without_bodies(Before(run, replace(read_row(folder.row(2, 4)), kind="voxels")))
+    assert not is_without_bodies(Before(run, replace(read_row(folder.row(2, 4)), kind="surfaces")))

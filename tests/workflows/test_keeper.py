@@ -145,6 +145,12 @@ def test_another_kind_must_also_predict_unseen_frames_better(scan):
             f"(training frames; between kinds views set aside: first {gain:+.1%} ± 1.0%)"
         )
     assert asked == [("voxels", "gaussians")] * 2
+    keeper = Keeper(train, True, lambda null, other: None)
+    keeper.look("first", good, 2)
+    keeper.look("second", voxels, 2)
+    assert keeper.best is not None
+    assert keeper.best.name == "first"
+    assert keeper.decisions[0].by == "training frames"
 
 
 def test_old_summaries_say_nothing():

@@ -68,7 +68,9 @@ def test_what_predicts_better_is_taken_and_what_is_not_there_is_not(scan):
     ways = {"still": lambda part: wrong, "flow": lambda part: None, "bodies": missing}
     decision = decide(scan.train(), lambda part: right, ways)
     assert decision.choice == "each"
-    assert [each.loses for each in decision.compared] == [True, True, True]
+    assert [(each.name, each.loses) for each in decision.compared] == [("still", True)]
+    assert "times set aside; without flow, for nothing moves; without bodies, for no body is seen" in decision.line
+    assert Decision.from_dict(decision.as_dict()).line == decision.line
 
 
 def truth() -> MeshScene:

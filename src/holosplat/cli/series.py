@@ -216,6 +216,8 @@ def collect(folder: Positional[Path], fronts: bool = False) -> None:
     for path in (series.table, series.bodies, series.events, series.tracks, series.page, *[series.fronts] * fronts):
         say(f"wrote {path}")
     put(verdict_of([row for row in found.rows if row is not None]))
+    if found.no_events:
+        say(found.no_events)
     if found.missing:
         say(f"{len(found.missing)} of {len(found.moments)} times are missing: {some(found.missing)}")
         raise SystemExit(UNFINISHED)

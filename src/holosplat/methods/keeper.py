@@ -18,8 +18,8 @@ from .cross_validation import MissingMatter, predicted_frames
 NAME = "result"
 BY = "training frames"
 
-Unseen = Callable[[str, str], Decision]
-"""Which of two kinds of Objects predicts unseen frames, the null first."""
+Unseen = Callable[[str, str], Decision | None]
+"""Which of two kinds of Objects predicts unseen frames, the null first; None where that cannot be compared."""
 
 
 @dataclass(frozen=True)
@@ -46,10 +46,10 @@ class Keeper:
     mixed: whether states of different kinds of Objects compete; else those of another kind than the latest are out, for
     who asks for surfaces wants surfaces
 
-    unseen: decides between two kinds; None: training frames do
+    unseen: decides between two kinds; None, or where it tells nothing: training frames do
 
     The latest state is the null: an earlier one is kept if it explains the frames better by the policy of `Compared`.
-    One of another kind, whose freedom is another, must also predict unseen frames better.
+    One of another kind, whose freedom is another, must also predict unseen frames better, where `unseen` tells that.
     """
 
     train: Scan
@@ -93,8 +93,9 @@ class Keeper:
             return not (same and compared.wins and _lost(latest.predicted, best.predicted))
         if compared.wins and not same and self.unseen is not None:
             decision = self.unseen(latest.object.kind, best.object.kind)
-            compared = replace(decision.compared[0], name=best.name)
-            self.by = f"{BY}; between kinds {decision.by}"
+            if decision is not None:
+                compared = replace(decision.compared[0], name=best.name)
+                self.by = f"{BY}; between kinds {decision.by}"
         self.compared.append(compared)
         return not compared.wins
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,33 @@ WORTH = 0.5
 """Gain of the log-likelihood below which a step is the last: by so much one of the unknowns moves it on average."""
 MOST = 30
 """Steps at most; Gauss and Newton's take about eight."""
+
+
+@dataclass(frozen=True)
+class ProfileErrors:
+    """What frames tell of a spherical volume. centre: standard errors of `(x, y, z)` [m]; spacing: of the radii 0, 1, …
+    of the profile [m]; covariance: [K, K] of δ at these, between which it is linear"""
+
+    centre: tuple[float, ...]
+    spacing: float
+    covariance: np.ndarray
+
+    def hats(self, radii: np.ndarray) -> np.ndarray:
+        """Derivatives [N, K] of δ at N radii [m] by that at the radii of the profile."""
+        away = radii[:, None] / self.spacing - np.arange(len(self.covariance))
+        return np.maximum(1 - np.abs(away), 0.0)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, ready for JSON; `from_dict` reads them."""
+        return {"centre_m": self.centre, "spacing_m": self.spacing, "covariance": self.covariance.tolist()}
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> ProfileErrors:
+        """What `as_dict` described. Errors: `KeyError`, `TypeError` or `ValueError` for anything else."""
+        covariance = np.array(values["covariance"], dtype=np.float64)
+        if covariance.ndim != 2 or covariance.shape[0] != covariance.shape[1]:
+            raise ValueError("covariance")
+        return cls(tuple(map(float, values["centre_m"])), float(values["spacing_m"]), covariance)
 
 
 class Sphere:
@@ -98,15 +126,16 @@ class Sphere:
         else:
             self.ended = gained < WORTH or self.done >= MOST
 
-    @property
-    def error_of_sum(self) -> float:
-        """Standard error of the sum of the volume, of which no value is unknown beyond the last one that is not 0:
-        large, for frames hardly tell slow changes of the profile."""
-        _, matrix, _, sums = self._equations()
+    def errors(self) -> tuple[float, Tensor]:
+        """Standard error of the sum of the volume, and covariance of the unknowns, of which no value is unknown beyond
+        the last one that is not 0. The error of the sum is large, for frames hardly tell slow changes of the profile.
+        """
+        level, matrix, _, sums = self._equations()
         last = AXES + 1 + int(self.unknowns[AXES:].nonzero().max())
-        matrix, sums = matrix[:last, :last], sums[:last]
+        matrix, sums, level = matrix[:last, :last], sums[:last], level[:last]
         regular = matrix + LEAST * matrix.diag().max() * torch.eye(last, dtype=matrix.dtype)
-        return math.sqrt(float(sums @ torch.linalg.solve(regular, sums)))
+        covariance = torch.linalg.inv(regular)
+        return math.sqrt(float(sums @ covariance @ sums)), covariance * torch.outer(level, level)
 
     def _equations(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Units of the unknowns, and in these the second derivatives, minus the gradient, and the slopes of the sum."""
@@ -213,10 +242,13 @@ class SphericalFit:
         """How much of the work is done."""
         return 1.0 if self.finished else self.step / MOST
 
-    @property
-    def error_of_total(self) -> float:
-        """Standard error of the total δ [m³]."""
-        return self._sphere.error_of_sum * abs(self._unit)
+    def errors(self) -> tuple[float, ProfileErrors]:
+        """Standard error of the total δ [m³], and those of centre and profile."""
+        error, covariance = self._sphere.errors()
+        centre = covariance.diag()[:AXES].sqrt().flip(0) * self._begun.grid.voxel_size[0]
+        values = covariance[AXES:, AXES:] * self._begun.matter.delta**2
+        spacing, unit = self._begun.grid.voxel_size[0], abs(self._unit)
+        return error * unit, ProfileErrors(tuple(centre.tolist()), spacing, values.numpy())
 
     @property
     def voxels(self) -> VoxelGrid:

@@ -260,11 +260,15 @@ def unseen_kinds(task: Task, method: Method) -> Unseen | None:
     return partial(decide_kind, task, method) if method.mixes_kinds and task.freedom is None else None
 
 
-def decide_kind(task: Task, method: Method, null: str, other: str) -> Decision:
+class _NotMade(Exception):
+    """A kind that a short run does not make."""
+
+
+def decide_kind(task: Task, method: Method, null: str, other: str) -> Decision | None:
     """Which kind of result predicts unseen views, where `method` makes both on its way; null: the kind of its last one.
 
-    The method runs on coarse frames of the other views, with a part `EFFORT` of its steps. A kind that it does not make
-    there predicts what its last state does. Two views are compared by data fission.
+    The method runs on coarse frames of the other views, with a part `EFFORT` of its steps. Where it does not make both
+    there, they cannot be compared: None. Two views are compared by data fission.
     """
     folds = Folds.of(task.scan)
 
@@ -281,12 +285,15 @@ def decide_kind(task: Task, method: Method, null: str, other: str) -> Decision:
         with suppress(NoMatterError):  # what is made before it stands
             run_stages(method.with_effort(EFFORT), part, look)
         expected = {kind: predicted_frames(unseen.exposures, *state) for kind, state in last.items()}
-        expected = expected or {null: torch.ones(unseen.frames.shape)}
         return {kind: Score.of(unseen.left(frames.double())) for kind, frames in expected.items()}
 
     def score(kind: str, fold: int) -> Score:
-        found = scores(fold)
-        return found.get(kind) or list(found.values())[-1]
+        if kind not in scores(fold):
+            raise _NotMade
+        return scores(fold)[kind]
 
     task.on_progress(KIND, 0.0)
-    return select(NAME, (null, other), score, folds.count, by=folds.by)
+    try:
+        return select(NAME, (null, other), score, folds.count, by=folds.by)
+    except _NotMade:
+        return None

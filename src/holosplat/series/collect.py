@@ -16,9 +16,11 @@ from ..io.objects import read_object
 from ..tables import number_in
 from ..workflows.motion_choice import begun_motion
 from ..workflows.run_folder import RunFolder
-from .events import EVENT_COLUMNS, FRONT_COLUMNS, PARTS, TRACK_COLUMNS, Front, History, Parts, front_rows
+from ..workflows.totals import TotalMatter
+from .events import EVENT_COLUMNS, PARTS, TRACK_COLUMNS, History, Parts
 from .folder import Body, Row, SeriesFolder, TaskState, plain, time_left
-from .one_time import PHASE
+from .fronts import FRONT_COLUMNS, Front, front_rows
+from .one_time import PHASE, Before, is_without_bodies
 from .plan import Moment, SeriesPlan
 
 if TYPE_CHECKING:
@@ -35,7 +37,8 @@ BODY_COLUMNS = ("number", "time_s", "body", "x_m", "y_m", "z_m", "volume_m3")
 @dataclass(frozen=True)
 class Collected:
     """A series and its results so far. rows: of each time, None where it is missing; task: that it is of; runs: its
-    run folder; agreement: mean distance [m] of bodies at times that two tasks have done, by the later task."""
+    run folder; agreement: mean distance [m] of bodies at times that two tasks have done, by the later task;
+    without_bodies: numbers of the times of matter that has none."""
 
     plan: SeriesPlan
     states: tuple[TaskState, ...]
@@ -45,6 +48,14 @@ class Collected:
     runs: tuple[Path, ...]
     bodies: tuple[tuple[int, ...], ...]
     agreement: dict[int, float] = field(default_factory=dict)
+    without_bodies: tuple[int, ...] = ()
+
+    @property
+    def no_events(self) -> str:
+        """Why some times have no events; empty where all may have some."""
+        some = f"{len(self.without_bodies)} of {len(self.moments)} times"
+        why = "continuous matter on both sides of its medium, or spherical matter, has no bodies"
+        return f"{some} have no events of bodies: {why}" if self.without_bodies else ""
 
     @property
     def missing(self) -> list[int]:
@@ -144,15 +155,20 @@ def collect(folder: SeriesFolder, fronts: bool = False) -> Collected:
     from .page import write_page  # which needs matplotlib
 
     found = collected(folder)
-    seen = [(moment, run / PARTS) for moment, run in zip(found.moments, found.runs) if (run / PARTS).is_file()]
-    history = History.of([Parts.read(path) for _, path in seen])
-    numbers, times = [moment.number for moment, _ in seen], [moment.time for moment, _ in seen]
+    done = [(m, row, run) for m, row, run in zip(found.moments, found.rows, found.runs) if row is not None and row.done]
+    whole = {moment.number for moment, row, run in done if is_without_bodies(Before(RunFolder(run), row))}
+    found = replace(found, without_bodies=tuple(sorted(whole)))
+    seen = [(moment, run) for moment, _, run in done if moment.number in whole or (run / PARTS).is_file()]
+    parted = [(moment, run) for moment, run in seen if moment.number not in whole]
+    history = History.of([Parts.read(run / PARTS) for _, run in parted])
+    numbers, times = [moment.number for moment, _ in parted], [moment.time for moment, _ in parted]
     write_rows(folder.events, EVENT_COLUMNS, history.event_rows(numbers, times))
     write_rows(folder.tracks, TRACK_COLUMNS, history.track_rows(numbers, times))
     write_rows(folder.table, COLUMNS, _lines(folder, found))
     write_rows(folder.bodies, BODY_COLUMNS, _body_lines(found))
     if fronts:
-        write_rows(folder.fronts, FRONT_COLUMNS, front_rows(numbers, times, [_front(path.parent) for _, path in seen]))
+        numbers, when = [moment.number for moment, _ in seen], [moment.time for moment, _ in seen]
+        write_rows(folder.fronts, FRONT_COLUMNS, front_rows(numbers, when, [_front(run) for _, run in seen]))
     write_page(folder.page, replace(page_of(folder, found), events=tuple(history.lines(times))))
     return found
 
@@ -160,9 +176,11 @@ def collect(folder: SeriesFolder, fronts: bool = False) -> Collected:
 def _front(run: Path) -> Front:
     """Of the object that a run found, on voxels of the pixels."""
     folder = RunFolder(run)
-    seen = folder.read_summary()["detector"]
+    summary = folder.read_summary()
+    seen, total = summary["detector"], summary.get("total")
     grid = Grid.centred((seen["columns"], seen["rows"], seen["columns"]), seen["pixel_size_m"])
-    return Front.of(read_object(folder.object).voxelise(grid))
+    told = TotalMatter.from_dict(total).profile if total else None
+    return Front.of(read_object(folder.object).voxelise(grid), told)
 
 
 def _lines(folder: SeriesFolder, found: Collected) -> Iterable[list[object]]:
@@ -209,6 +227,7 @@ def page_of(folder: SeriesFolder, found: Collected) -> SeriesPage:
         for task, apart in found.agreement.items()
         if apart == apart
     ]
+    notes += [found.no_events] if found.no_events else []
     chosen = begun_motion(folder.path)
     summary = f"{time_left(found.states)}." + (f" {chosen.line.replace('-', '−')}." if chosen else "")
     return SeriesPage("A series", headline(verdict, frames), summary, tuple(frames), failed, tuple(notes))

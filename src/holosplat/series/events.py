@@ -1,4 +1,4 @@
-"""What happens between times: bodies and holes merge, split, appear and vanish, with tracks as a tree; fronts run."""
+"""What happens between times: bodies and holes merge, split, appear and vanish, with tracks as a tree."""
 
 from __future__ import annotations
 
@@ -10,17 +10,12 @@ from typing import Literal
 
 import numpy as np
 from scipy import ndimage
-from scipy.optimize import least_squares
-from scipy.special import ndtr
 
 from ..bodies.rest_shape import LEAST_VOLUME, LEVEL
 from ..checks import as_written, require
 from ..geometry import Grid
-from ..inference import MARGIN
 from ..io.atomic import atomic_path
-from ..motion.track_linking import path_degree
 from ..representations import Stored
-from ..volume import Volume
 
 PARTS = "parts.npz"
 """The connected parts of a time, in its run folder."""
@@ -29,13 +24,6 @@ MOST_VOXELS = 160
 Of = Literal["body", "hole"]
 WHAT: dict[Of, str] = {"body": "bodies", "hole": "holes"}
 EVENT_COLUMNS = ("first", "last", "first_s", "last_s", "event", "of", "before", "after", "x_m", "y_m", "z_m")
-FRONT_COLUMNS = (
-    *("number", "time_s", "x_m", "y_m", "z_m", "radius_m", "radius_error_m"),
-    *("step_delta", "step_error_delta", "speed_m_s", "speed_error_m_s"),
-)
-SHELL, THINNEST, NARROWEST, MOST_FITTED = 0.3, 2.0, 0.3, 20_000
-"""Half the thickness of the shell in which a front is fitted, as a share of its radius, and in voxels at least; the
-least width of the front [voxels]; voxels of the shell, at most."""
 TRACK_COLUMNS = ("track", "of", "first", "last", "first_s", "last_s", "parents", "first_volume_m3", "last_volume_m3")
 
 
@@ -259,103 +247,3 @@ def _groups(edges: np.ndarray) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
         (tuple(np.flatnonzero(group[:k] == g).tolist()), tuple(np.flatnonzero(group[k:] == g).tolist()))
         for g in range(count)
     ]
-
-
-@dataclass(frozen=True)
-class Front:
-    """A spherical front in a volume. centre: `(x, y, z)` m; radius: [m]; step: δ just inside less that outside; errors:
-    [5] standard errors of centre, radius and step"""
-
-    centre: np.ndarray
-    radius: float
-    step: float
-    errors: np.ndarray
-
-    @classmethod
-    def of(cls, volume: Volume, seed: int = 0) -> Front:
-        """The spherical front that runs from the middle of the matter.
-
-        The radial mean shows where; then centre, radius, step, what is behind it (a polynomial of degree two of the
-        depth, for a thin shell falls off within the fitted one), level before it and width are fitted to the voxels of
-        a shell by least squares. Eighths of the directions left out in turn (jackknife) give the errors,
-        since errors of neighbouring voxels go together. Errors: `InputError` where nothing is in the volume.
-        """
-        unit = float(min(volume.grid.voxel_size))
-        x, y, z = (axis / unit for axis in volume.grid.axes())
-        places = np.stack(np.meshgrid(z, y, x, indexing="ij"), axis=-1).reshape(-1, 3)[:, ::-1]
-        values = volume.delta.ravel() / float(np.abs(volume.delta).max(initial=1e-30))
-        require(bool(values.any()), "a front needs matter that changes, but the volume is empty; check the run.")
-        centre = np.average(places, axis=0, weights=values**2)
-        numbers = np.array([*centre, _jump(places - centre, values), 0.0, 0.7])
-        random = np.random.default_rng(seed)
-        for _ in range(3):
-            away = np.linalg.norm(places - numbers[:3], axis=1)
-            shell = np.flatnonzero(np.abs(away - numbers[3]) < max(SHELL * numbers[3], THINNEST))
-            chosen = shell if len(shell) <= MOST_FITTED else random.choice(shell, MOST_FITTED, replace=False)
-            numbers = _fitted(places[chosen], values[chosen], numbers)
-        octant = (places[chosen] > numbers[:3]) @ np.array([1, 2, 4])
-        kept = [_fitted(places[chosen][octant != k], values[chosen][octant != k], numbers) for k in range(8)]
-        errors = np.sqrt(7 * np.var(np.array(kept)[:, :5], axis=0))
-        scale = np.array([unit] * 4 + [float(np.abs(volume.delta).max())])
-        found = numbers[:5] * scale
-        return cls(found[:3], float(found[3]), float(found[4]), errors * scale)
-
-
-def _jump(places: np.ndarray, values: np.ndarray) -> float:
-    """Radius at which what is uneven farther out falls by the largest factor: a front runs into what is even.
-
-    Uneven are radial means about the middle of `places` [N, 3]: their squares about their mean, by voxels. Less than
-    `MARGIN` of all, as a part of the root, matters in practice no more.
-    """
-    ring = np.linalg.norm(places, axis=1).astype(int)
-    last = max(5, int(np.abs(places).max()))  # beyond it directions are missing
-    count, total = (np.bincount(ring, weight, last + 1)[: last + 1] for weight in (None, values))
-    squares = total**2 / np.maximum(count, 1)
-    far = [np.cumsum(part[::-1])[::-1] for part in (count, total, squares)]
-    uneven, radii = far[2] - far[1] ** 2 / far[0], np.arange(2, last - 1)
-    least = MARGIN**2 * uneven[0]
-    return float(radii[((uneven[radii - 2] + least) / (uneven[radii + 1] + least)).argmax()])
-
-
-def _fitted(places: np.ndarray, values: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Centre, radius, step, width that fit best."""
-
-    def design(numbers: np.ndarray) -> np.ndarray:
-        depth = numbers[3] - np.linalg.norm(places - numbers[:3], axis=1)
-        step = ndtr(depth / numbers[4])
-        return np.stack([step, step * depth, step * depth**2, np.ones_like(step)], axis=1)
-
-    def best(shape: np.ndarray) -> np.ndarray:
-        return np.linalg.lstsq(shape, values, rcond=None)[0]
-
-    def missed(numbers: np.ndarray) -> np.ndarray:
-        shape = design(numbers)
-        return shape @ best(shape) - values
-
-    first, radius = start[[0, 1, 2, 3, 5]], start[3]
-    reach = np.array([0.5 * radius] * 4 + [np.inf])
-    low, high = first - reach, first + reach
-    low[4], high[4] = NARROWEST, max(radius, 2 * NARROWEST)
-    found = least_squares(missed, np.clip(first, low, high), bounds=(low, high)).x
-    return np.array([*found[:4], best(design(found))[0], found[4]])
-
-
-def front_rows(numbers: Sequence[int], times: Sequence[float], fronts: Sequence[Front]) -> Iterable[list[object]]:
-    """Rows of `FRONT_COLUMNS`. The speed is that of a polynomial of time through the radii, of the degree, up to two,
-    that predicts those left out; its error follows from their scatter about it."""
-    radii, when = np.array([front.radius for front in fronts]), np.asarray(times, dtype=np.float64)
-    speeds = np.full((len(fronts), 2), np.nan)
-    if len(fronts) > 2:
-        scaled = (when - when[0]) / (when[-1] - when[0])
-        degree = max(1, path_degree(scaled, radii[:, None], 2))
-        design = np.vander(scaled, degree + 1)
-        slope = np.stack([k * scaled ** max(k - 1, 0) for k in range(degree, -1, -1)], axis=1) / (when[-1] - when[0])
-        inverse = np.linalg.pinv(design)
-        left = radii - design @ (inverse @ radii)
-        variance = float(left @ left) / max(len(left) - degree - 1, 1)
-        speeds = np.stack(
-            [slope @ (inverse @ radii), np.sqrt(variance * np.square(slope @ inverse).sum(axis=1))], axis=1
-        )
-    for number, time, front, speed in zip(numbers, when, fronts, speeds):
-        told = [*front.centre, front.radius, front.errors[3], front.step, front.errors[4], *speed]
-        yield [number, f"{time:.9g}", *(f"{value:.6g}" for value in told)]

@@ -26,7 +26,7 @@ from ..methods.illumination import prepared
 from ..methods.keeper import NAME, Keeper
 from ..methods.trials import decide_kind
 from ..progress import FitProgress, FitState
-from ..representations import Stored, SurfaceMesh
+from ..representations import Stored, SurfaceMesh, VoxelGrid
 from ..scan import Scan
 from ..units import wavenumber
 from ..workflows.evaluate import Evaluation, evaluate, render
@@ -106,7 +106,7 @@ def reconstruct_time(
         return _written(shot, settings, folder, done, row, began)
     alone = RunFolder(folder.path.with_name(f"{folder.path.name}.cold"))
     cold = _run(shot, settings, settings.method, alone, on_progress, on_state=on_state)
-    decision = _better(shot, settings, {"warm": done, "cold": cold}, alone)
+    decision = _better(shot, _known(before), settings, {"warm": done, "cold": cold}, alone)
     said = {"begun": "warm" if decision.choice == "warm" else "anew", "decided": decision.line}
     if decision.choice == "warm":
         shutil.rmtree(alone.path)
@@ -156,7 +156,7 @@ def retry_time(
         _remove_other(other, method)
         tried, kept = _run(shot, settings, method, other, on_progress, after), load_reconstruction(folder)
         found = {"kept": kept, begun: tried} if told else {begun: tried, "kept": kept}
-        decision = _better(shot, settings, found, folder)
+        decision = _better(shot, _known(after), settings, found, folder)
         done = None if decision.choice == "kept" else tried
         said = {"begun": begun if done else own.row.begun, "decided": decision.line}
         write_json((other if done else folder).path / noted, said)
@@ -199,6 +199,15 @@ def is_spherical(own: Before) -> bool:
     return _known(own).spherical
 
 
+def is_without_bodies(own: Before) -> bool:
+    """Whether a finished time is of continuous matter on both sides of its medium, or of spherical matter: it fills the
+    field, and parts above half of its material's δ, which is that of a voxel somewhere, are no bodies."""
+    if own.row.kind != VoxelGrid.kind:
+        return False
+    known = _known(own)
+    return known.two_sided or known.spherical
+
+
 def _left(done: Reconstruction, scan: Scan) -> Score:
     """The score of a result on the training frames of `scan`."""
     train = done.placed(scan).train()
@@ -225,11 +234,14 @@ def _as_good(left: Score, reference: Path) -> bool:
     return other.powers.shape == left.powers.shape and not Compared("", *left.gain_over(other)).loses
 
 
-def _better(shot: Shot, settings: Settings, found: Mapping[str, Reconstruction], by: RunFolder) -> Decision:
+def _better(
+    shot: Shot, prior: MaterialPrior, settings: Settings, found: Mapping[str, Reconstruction], by: RunFolder
+) -> Decision:
     """The better one of two results, the null last: by the policy of a run's states (`Keeper`), in the light that
-    the run `by` decided for."""
-    task = Task(shot.scan.train(), shot.prior, settings.seed, light=settings.light)
-    task = prepared(task, settings.method, decided_before(by.read_config()["decided"]))
+    the run `by` decided for; prior: of the result that goes on from another time, with its sides."""
+    task = Task(shot.scan.train(), prior, settings.seed, light=settings.light)
+    taken, _ = decided_before(by.read_config()["decided"])
+    task = prepared(task, settings.method, (taken, ()))
     keeper = Keeper(task.scan, mixed=True, unseen=partial(decide_kind, task, settings.method))
     for name, done in found.items():
         keeper.look(name, done.object, done.oversample)
@@ -300,7 +312,7 @@ def _written(shot: Shot, settings: Settings, folder: RunFolder, done: Reconstruc
         scan = done.placed(shot.scan)
         evaluation = evaluate(done, scan, None)
         write_phase(folder.path / PHASE, done.object, scan)
-        if done.object.matter.delta:
+        if done.object.matter.delta and not is_without_bodies(Before(folder, filled(row, done, evaluation))):
             Parts.of(done.object, Grid.of_views(scan.views)).write(folder.path / PARTS)
         if not (folder.path / REFERENCE).is_file():
             _keep(folder, _left(done, shot.scan).powers)

@@ -97,8 +97,11 @@ def begun_motion(folder: Path) -> Decision | None:
         return found
 
 
-def decide(train: Scan, alone: Way, ways: Mapping[str, Way]) -> Decision:
-    """The decision between times `alone`, the null, and `ways` of all times, each from simple to complex."""
+def decide(train: Scan, alone: Callable[[Scan], Object], ways: Mapping[str, Way]) -> Decision:
+    """The decision between times `alone`, the null, and `ways` of all times, each from simple to complex.
+
+    A way that finds nothing is not compared; the decision says why.
+    """
     times = train.instants
     require(
         len(times) >= FEWEST,
@@ -112,25 +115,27 @@ def decide(train: Scan, alone: Way, ways: Mapping[str, Way]) -> Decision:
     unseen = [frames[n % len(frames)] for n, frames in enumerate(of_time)]
     others = train[np.flatnonzero(~np.isin(train.exposures.time, times[aside]))]
 
-    @cache
-    def found(name: str) -> Object | None:
+    found, by = dict[str, Object](), BY
+    for name, way in ways.items():
         try:
-            return ways[name](others)
-        except InputError:  # there is no matter of this kind
-            return None
+            matter, why = way(others), "nothing moves"
+        except InputError as error:
+            matter, why = None, str(error).rstrip(".")
+        if matter is None:
+            by += f"; without {name}, for {why}"
+        else:
+            found[name] = matter
 
     @cache
-    def single(n: int) -> Object | None:
+    def single(n: int) -> Object:
         return alone(train[np.setdiff1d(of_time[n], unseen[n : n + 1])].as_static())
 
     def score(name: str, fold: int) -> Score:
         left = []
         for n, frame in enumerate(unseen):
             part = train[[frame]].as_static()
-            matter = single(n) if name == "each" else found(name)
-            now = None if matter is None else matter.at(float(times[aside[n]]))
-            predicted = torch.ones(part.frames.shape) if now is None else predicted_frames(part.exposures, now)
-            left.append(part.left(predicted))
+            now = (single(n) if name == "each" else found[name]).at(float(times[aside[n]]))
+            left.append(part.left(predicted_frames(part.exposures, now)))
         return Score.of(torch.cat(left))
 
-    return select(MOTION, ("each", *ways), score, by=BY)
+    return select(MOTION, ("each", *found), score, by=by)

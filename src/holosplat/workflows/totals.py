@@ -16,7 +16,7 @@ from ..frames import evenly
 from ..geometry import Grid
 from ..methods import Task
 from ..methods.modulation import DOUBTFUL, RATIO_SHARE, Total, total_delta
-from ..methods.spherical import SphericalFit
+from ..methods.spherical import ProfileErrors, SphericalFit
 from ..methods.uncertain import Determined
 from ..methods.volume import SmoothStage, SmoothVolume, binning
 from ..optics.noise import NoiseModel
@@ -37,13 +37,15 @@ WIDE = 2.0
 @dataclass(frozen=True)
 class TotalMatter:
     """The total of a run. quantity: of which index; value, error: it and its standard error [m³], None for empty
-    volumes; held: what the volume of the reconstruction has of it [m³]; words: all this in a line."""
+    volumes; held: what the volume of the reconstruction has of it [m³]; words: all this in a line; profile: errors of
+    centre and profile of spherical matter"""
 
     quantity: Literal["δ", "β"]
     value: float | None
     error: float | None
     held: float
     words: str
+    profile: ProfileErrors | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, ready for JSON; `from_dict` reads them."""
@@ -53,6 +55,7 @@ class TotalMatter:
             "standard_error_m3": self.error,
             "held_m3": self.held,
             "words": self.words,
+            **({"profile": self.profile.as_dict()} if self.profile else {}),
         }
 
     @classmethod
@@ -63,7 +66,9 @@ class TotalMatter:
                 (None if (v := values[k]) is None else float(v)) for k in ("value_m3", "standard_error_m3")
             )
             quantity: Literal["δ", "β"] = "δ" if values["quantity"] == "delta" else "β"
-            return cls(quantity, _float(number), _float(error), float(values["held_m3"]), str(values["words"]))
+            profile = ProfileErrors.from_dict(values["profile"]) if "profile" in values else None
+            held = float(values["held_m3"])
+            return cls(quantity, _float(number), _float(error), held, str(values["words"]), profile)
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"a total must be what reconstruct wrote, but it lacks or garbles {error}.") from error
 
@@ -86,9 +91,9 @@ def total_of_run(said: Prediction, frames: Scan, task: Task, constants: tuple[De
     if task.prior.spherical and isinstance(found, VoxelGrid) and bool(found.values.any()):
         fit = SmoothStage(SmoothVolume()).fit(task, found)
         assert isinstance(fit, SphericalFit)
-        error = fit.error_of_total
+        error, profile = fit.errors()
         words = f"total {quantity} against {against} {held:.3g} m³ ± {error:.2g} m³, of spherical matter"
-        return TotalMatter(quantity, held, error, held, words)
+        return TotalMatter(quantity, held, error, held, words, profile)
     if task.prior.two_sided:
         words = (
             f"total {quantity} against {against} {held:.3g} m³ in the volume; of matter on both sides no error is known"
