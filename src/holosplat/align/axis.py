@@ -191,7 +191,8 @@ def _ratio(prior: MaterialPrior) -> float | None:
 
 
 def _judged(axis: Axis, scan: Scan, prior: MaterialPrior, light: LightOptions) -> Axis:
-    """The axis as views set aside judge it, by volumes of the others about it and about the one of `scan`."""
+    """The axis as views set aside judge it, by volumes of the others about it and about the one of `scan`, each of the
+    material that fits it: a wrong axis tells a wrong one."""
     voxel, some = coarse_binning(scan), evenly(len(scan), PICTURE_VIEWS)
     tilted = axis.leans and axis.lean is not None and abs(axis.lean.value) * scan.views.shape[0] > voxel
     if 2 * abs(axis.offset.value) <= voxel and not tilted:
@@ -200,9 +201,9 @@ def _judged(axis: Axis, scan: Scan, prior: MaterialPrior, light: LightOptions) -
     placed = {GIVEN: given, FOUND: axis._moved(given, axis.leans and not tilted)}
     if tilted:
         placed[LEANING] = axis._moved(given, True)
-    first = FirstVolumes(Folds.of(frames), prior, lambda stage, fraction: None)
     folds = {name: Folds.of(frames.taken(exposures[some])) for name, exposures in placed.items()}
-    trials = {name: Trials(first.of(each), LightOptions()) for name, each in folds.items()}
+    firsts = {name: FirstVolumes(each, prior, lambda stage, fraction: None) for name, each in folds.items()}
+    trials = {name: Trials(each, LightOptions()) for name, each in firsts.items()}
     nothing = GIVEN + WITHOUT
 
     def score(name: str, fold: int) -> Score:
@@ -210,7 +211,7 @@ def _judged(axis: Axis, scan: Scan, prior: MaterialPrior, light: LightOptions) -
 
     beside = dict.fromkeys(placed, (nothing,))
     # an offset is no simpler than another, and moments have told its size
-    decision = select(AXIS, tuple(placed), score, first.folds.count, by=first.folds.by, beside=beside, least=0.0)
+    decision = select(AXIS, tuple(placed), score, folds[GIVEN].count, by=folds[GIVEN].by, beside=beside, least=0.0)
     return replace(axis, judged=decision)
 
 

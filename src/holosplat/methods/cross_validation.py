@@ -212,10 +212,6 @@ class FirstVolumes:
         material = assumed_material(self.folds.scan, prior, self.on_progress, self.options.backend)
         return replace(self, _material=material, _made={})
 
-    def of(self, folds: Folds) -> FirstVolumes:
-        """Volumes of other folds, of the same material."""
-        return replace(self, folds=folds, _material=self.material, _made={})
-
     @property
     def _how(self) -> HolographicTV:
         return replace(self.options, two_sided=self.prior.two_sided)
