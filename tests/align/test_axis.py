@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from helpers.discs import PITCH, ball_lines
+from helpers.filled import filled
 from holosplat.align import Axis, AxisOptions, find_axis
-from holosplat.align.axis import BY_ALL, BY_MIRROR, LEAN, UPRIGHT
+from holosplat.align.axis import AXIS, BY_ALL, BY_MIRROR, FOUND, GIVEN, LEAN, LEANING, UPRIGHT
 from holosplat.align.consistency import Estimate, combined, polynomials
 from holosplat.checks import InputError
 from holosplat.geometry import Views, rotation_y
+from holosplat.matter import MaterialPrior
 from holosplat.scan import Exposures, Scan
 
 BALLS = ((9.0, -6.0, 4.0, 8.0), (-11.0, 2.0, 7.0, 6.0), (3.0, 9.0, -12.0, 5.0), (-6.0, -12.0, -9.0, 4.0))
@@ -146,6 +148,54 @@ def test_estimates_that_scatter_have_larger_errors_and_one_that_is_wrong_counts_
     assert agreed.error == pytest.approx(0.1 / np.sqrt(5), rel=0.2)
     assert scattered.error > 2 * agreed.error
     assert combined(np.array([1.0, 1.05, 0.95, 1.02, 9.0]), errors).value == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize(("name", "shape", "photons"), [("crack", (31, 32), None), ("jet", (32, 32), 3000.0)])
+def test_a_wrong_optimum_of_the_moments_is_not_applied(name, shape, photons):
+    """Matter that leaves the field, in eight views: the moments are sure of an axis that is several pixels off."""
+    scan = filled(name, shape, 8, photons)
+    found = find_axis(scan)
+    assert abs(found.offset.value) > 5
+    assert found.offset.compared(FOUND).wins
+    assert found.stays
+    assert not found.leans
+    assert found.applied(scan.exposures) is scan.exposures
+    said = {each.name: each.choice for each in found.decisions}
+    assert said[AXIS] == GIVEN
+    assert "the scan's is kept" in found.lines()[0]
+
+
+@pytest.mark.parametrize(("offset", "roll"), [(1.0, 0.0), (0.0, 2.5)])
+def test_an_axis_that_unseen_views_confirm_is_applied(offset, roll):
+    """Off by a pixel, or leaning: as many views as of the specimens above, with noise."""
+    scan = scan_of(np.arange(8) * 22.5, offset, roll, noise=0.002)
+    found = find_axis(scan)
+    assert found.judged is not None
+    assert found.judged.choice == (LEANING if roll else FOUND)
+    shifts = found.applied(scan.exposures).views.shifts[:, 0] / PITCH
+    np.testing.assert_allclose(shifts, -offset, atol=0.25)
+    assert found.leans == (roll != 0)
+
+
+def test_holes_in_a_medium_tell_an_axis_far_off():
+    """Bubbles, whose δ is said to lie below the water's: volumes of the other sign predict less than no matter."""
+    scan = filled("bubbles", (32, 32), 8, 3000.0)
+    moved = scan.with_views(replace(scan.views, shifts=scan.views.shifts + [4e-6, 0.0]))
+    found = find_axis(moved, prior=MaterialPrior.unknown(-1))
+    assert found.judged is not None
+    assert found.judged.choice == FOUND
+    assert found.offset.value == pytest.approx(4.0, abs=0.5)
+
+
+def test_a_small_correction_is_left_to_the_moments():
+    """It moves matter by less than first volumes resolve; it is applied where it is sure."""
+    scan = scan_of(HALF, 0.3, noise=0.002)
+    found = find_axis(scan)
+    assert found.judged is None
+    assert found.applied(scan.exposures).views.shifts[0, 0] / PITCH == pytest.approx(-0.3, abs=0.03)
+    unsure = replace(found, offset=Estimate(0.3, 0.1))
+    assert unsure.applied(scan.exposures) is scan.exposures
+    assert "the difference is not sure" in unsure.lines()[0]
 
 
 def test_a_lean_that_is_not_sure_is_left():

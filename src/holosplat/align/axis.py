@@ -11,14 +11,17 @@ import numpy as np
 from ..checks import InputError, at_least, in_range, require
 from ..frames import evenly
 from ..geometry import rotation_y
-from ..inference import Compared, Decision
+from ..inference import Compared, Decision, Score, select
+from ..matter import Known, KnownRatio, MaterialPrior
+from ..methods.cross_validation import PICTURE_VIEWS, FirstVolumes, Folds, coarse_binning
+from ..methods.trials import NULL, WITHOUT, Trials
 from ..optics.background import LightOptions
 from ..progress import Advance
 from ..ranges import checked_dataclass
 from ..rotations import angles_about_y
 from ..scan import Exposures, Scan
 from .consistency import (
-    Consistency,
+    AxisSearch,
     Estimate,
     HalfTurn,
     MirroredPairs,
@@ -27,13 +30,15 @@ from .consistency import (
     ends_of,
     half_turn,
     may_be_half,
+    minimum,
 )
-from .views import EVEN_OR_NOT, shadows
+from .views import EVEN_OR_NOT, in_even_light, shadows
 
 PLACE, BY_ALL, BY_MIRROR = "place of the axis", "consistency of all frames", "frames half a turn apart"
 STEP = 0.25
 """Distance of the places that are tried [columns]; a parabola finds the place between them."""
 LEAN, UPRIGHT, LEANING = "lean of the axis", "as the scan says", "leaning"
+AXIS, GIVEN, FOUND = "axis of rotation", "as the scan says", "found"
 FINE_REACH = 4
 """How far beside the place that a coarse search finds a fine one looks [columns]."""
 GROUPS = 8
@@ -71,6 +76,7 @@ class Axis:
     column: of the axis in the frames' middle row, 0 the middle of the first one; of the first view
     turn: where a half turn ends, if not where the scan says
     place: how its place was chosen, where frames half a turn apart tell one, too
+    judged: whether views set aside are predicted better about it, where first volumes resolve how far it lies
     """
 
     offset: Estimate
@@ -79,30 +85,46 @@ class Axis:
     rows: int
     turn: HalfTurn | None = None
     place: Decision | None = None
+    judged: Decision | None = None
+
+    @property
+    def stays(self) -> bool:
+        """Whether it is left as the scan says: it is not surely elsewhere, or predicts unseen views no better."""
+        if self.judged is not None:
+            return self.judged.choice == GIVEN
+        return self.turn is None and not (self.leans or self.offset.compared(FOUND).wins)
 
     @property
     def leans(self) -> bool:
         """Whether the axis leans for sure."""
-        return any(each.choice == LEANING for each in self.decisions)
+        return self._tilts and (self.judged is None or self.judged.choice == self.judged.compared[-1].name)
+
+    @property
+    def _tilts(self) -> bool:
+        """Whether the moments say so."""
+        return self.lean is not None and self.lean.compared(LEANING).wins
 
     @cached_property
     def decisions(self) -> tuple[Decision, ...]:
-        """On the place, where there are two, and on the lean, where the frames have enough rows."""
-        made = () if self.place is None else (self.place,)
-        if self.lean is None:
-            return made
-        found = self.lean.compared(LEANING)
-        return (*made, Decision(LEAN, LEANING if found.wins else UPRIGHT, "likelihood ratio", (found,)))
+        """On the place, where there are two, on the lean, where the frames have enough rows, and by unseen views."""
+        lean = None
+        if self.lean is not None:
+            choice = LEANING if self._tilts else UPRIGHT
+            lean = Decision(LEAN, choice, "likelihood ratio", (self.lean.compared(LEANING),))
+        return tuple(each for each in (self.place, lean, self.judged) if each is not None)
 
     def applied(self, exposures: Exposures) -> Exposures:
         """The exposures with the axis where it is: detector shifts, a roll `ω_z = -atan(lean)` where it leans, and the
-        angles of a half turn that ends elsewhere."""
+        angles of a half turn that ends elsewhere; the same where it `stays`."""
+        return exposures if self.stays else self._moved(exposures, self.leans)
+
+    def _moved(self, exposures: Exposures, leaning: bool) -> Exposures:
         views, p = exposures.views, exposures.views.pixel_size
         rotations = views.rotations
         if self.turn is not None:
             angles = np.unwrap(angles_about_y(views.rotations))
             rotations = rotations @ rotation_y(np.rad2deg(self.turn.spread(angles) - angles))
-        if self.leans and self.lean is not None:
+        if leaning and self.lean is not None:
             angle = -np.arctan(self.lean.value)
             c, s = np.cos(angle), np.sin(angle)
             rotations = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ rotations
@@ -112,16 +134,23 @@ class Axis:
     def lines(self) -> list[str]:
         """The result in words."""
         moved = f"{self.offset.value:+.3f} from the scan's"
-        said = [] if self.turn is None else [self.turn.line()]
-        said.append(f"axis at column {self.column:.3f} ± {self.offset.error:.3f} ({moved})")
+        said = [] if self.turn is None or self.stays else [self.turn.line()]
+        why = (
+            "the difference is not sure"
+            if self.judged is None
+            else "views set aside are predicted no better about this one"
+        )
+        kept = f"; the scan's is kept, for {why}" if self.stays else ""
+        said.append(f"axis at column {self.column:.3f} ± {self.offset.error:.3f} ({moved}){kept}")
         if self.lean is None:
             few = self.place is None or self.place.choice == BY_ALL
             why = "have too few rows to tell" if few else "do not show all of the matter, so that they do not tell"
             said.append(f"lean of the axis: the frames {why}")
         else:
             degrees = np.rad2deg(np.arctan([self.lean.value, self.lean.error]))
-            used = "" if self.leans else "; not sure, left as the scan says"
+            used = "" if self.leans else f"; {'' if self._tilts else 'not sure, '}left as the scan says"
             said.append(f"lean of the axis {degrees[0]:+.3f}° ± {degrees[1]:.3f}°{used}")
+        said += [] if self.judged is None else [self.judged.line]
         said.append(
             "sense of rotation: parallel beams cannot tell it, for the mirrored object that turns the other way gives "
             "the same frames; it stays as the scan says"
@@ -133,19 +162,63 @@ def find_axis(
     scan: Scan,
     options: AxisOptions = AxisOptions(),
     *,
-    ratio: float | None = None,
+    prior: MaterialPrior = MaterialPrior.unknown(),
     light: LightOptions = EVEN_OR_NOT,
     on_progress: Advance = lambda fraction: None,
 ) -> Axis:
     """The axis of the object that turns in `scan`, from the consistency of its projections.
 
+    Their moments tell an optimum and its error, but not whether another one, far off, is right: few views, fringes and
+    matter that leaves the field have several. So an axis that moves matter by more than a voxel of first volumes
+    between opposite views must predict views set aside surely better than the one that the scan says does, and better
+    than no matter. Where it moves matter by less, such volumes hardly tell the two apart, and the moments decide.
+
     Where matter leaves the frames, as in a half acquisition, projections are not consistent. Frames half a turn apart
     still mirror each other about the axis in the columns that both have. The axis at which they do best is taken where
     this is surely better than near the other one.
 
-    ratio: δ/β, if it is known. Errors: `InputError` for views that turn about no common axis, for fewer than
+    prior: of the material. Errors: `InputError` for views that turn about no common axis, for fewer than
     `FEWEST_VIEWS`, and where no place within the field is better than those beside it.
     """
+    return _judged(_by_moments(scan, options, _ratio(prior), light, on_progress), scan, prior, light)
+
+
+def _ratio(prior: MaterialPrior) -> float | None:
+    """δ/β, where it is known and positive."""
+    if isinstance(prior, KnownRatio):
+        return prior.ratio
+    return prior.materials[0].ratio if isinstance(prior, Known) and prior.materials[0].beta > 0 else None
+
+
+def _judged(axis: Axis, scan: Scan, prior: MaterialPrior, light: LightOptions) -> Axis:
+    """The axis as views set aside judge it, by volumes of the others about it and about the one of `scan`, each of the
+    material that fits it: a wrong axis tells a wrong one."""
+    voxel, some = coarse_binning(scan), evenly(len(scan), PICTURE_VIEWS)
+    tilted = axis.leans and axis.lean is not None and abs(axis.lean.value) * scan.views.shape[0] > voxel
+    if 2 * abs(axis.offset.value) <= voxel and not tilted:
+        return axis
+    given, frames = scan.exposures, in_even_light(scan[some], light)
+    placed = {GIVEN: given, FOUND: axis._moved(given, axis.leans and not tilted)}
+    if tilted:
+        placed[LEANING] = axis._moved(given, True)
+    folds = {name: Folds.of(frames.taken(exposures[some])) for name, exposures in placed.items()}
+    firsts = {name: FirstVolumes(each, prior, lambda stage, fraction: None) for name, each in folds.items()}
+    trials = {name: Trials(each, LightOptions()) for name, each in firsts.items()}
+    nothing = GIVEN + WITHOUT
+
+    def score(name: str, fold: int) -> Score:
+        return trials[GIVEN].score(NULL + WITHOUT, fold) if name == nothing else trials[name].score(NULL, fold)
+
+    beside = dict.fromkeys(placed, (nothing,))
+    # an offset is no simpler than another, and moments have told its size
+    decision = select(AXIS, tuple(placed), score, folds[GIVEN].count, by=folds[GIVEN].by, beside=beside, least=0.0)
+    return replace(axis, judged=decision)
+
+
+def _by_moments(
+    scan: Scan, options: AxisOptions, ratio: float | None, light: LightOptions, on_progress: Advance
+) -> Axis:
+    """The axis that moments, or frames half a turn apart, tell."""
     sinograms = sinograms_of(scan, options, ratio, light)
     pairs, found = MirroredPairs.of(sinograms), None
     try:
@@ -256,111 +329,3 @@ def _mean_row(images: np.ndarray) -> np.ndarray:
         if there.any():
             row[~there] = np.interp(np.flatnonzero(~there), np.flatnonzero(there), row[there])
     return rows
-
-
-FEWEST_SLICES = 4
-"""Slices that a lean needs at least."""
-LEANS = 24
-"""Leans that are tried on either side of a first one."""
-
-
-@dataclass(frozen=True)
-class AxisSearch:
-    """Residuals with the axis at each of T offsets.
-
-    offsets: [T], evenly spaced [pixels]
-    unexplained: [T, N, B] sums of squares of each order, in each slice
-    freedom: [N] numbers in each of these sums
-    octaves: [N] which octave each order belongs to
-    heights: [B] of the slices [pixels]
-    """
-
-    offsets: np.ndarray
-    unexplained: np.ndarray
-    freedom: np.ndarray
-    octaves: np.ndarray
-    heights: np.ndarray
-
-    @classmethod
-    def of(cls, sinograms: Sinograms, near: float, reach: float, step: float, on_progress: Advance) -> AxisSearch:
-        """Offsets within `reach` of `near`, `step` apart [pixels]."""
-        count = max(2, int(np.ceil(reach / step)))
-        offsets = near + step * np.arange(-count, count + 1)
-        judge = Consistency(sinograms, float(np.abs(sinograms.positions).max() + np.abs(offsets).max()))
-        found = []
-        for t, offset in enumerate(offsets):
-            found.append(judge.unexplained(float(offset)))
-            on_progress((t + 1) / len(offsets))
-        tiny = 1e-18 * float((sinograms.values**2).sum()) + 1e-300
-        octaves = np.log2(judge.orders).astype(int)
-        return cls(offsets, np.stack(found) + tiny, judge.freedom, octaves, sinograms.heights)
-
-    def likeliest(self) -> tuple[float, float]:
-        """The likeliest offset [pixels] and lean [columns a row], all orders together.
-
-        Errors: `InputError` where the offset is at the end of those that were tried.
-        """
-        every = np.ones(len(self.octaves), dtype=bool)
-        leans, curves = self._curves(every, 0.0)
-        best = int(curves.min(1).argmin())
-        at = int(curves[best].argmin())
-        require(
-            0 < at < len(self.offsets) - 1,
-            "the projections tell no axis within the field; check the angles, or say where it is by --axis-column.",
-        )
-        return float(self.offsets[at]), float(leans[best])
-
-    def found(self, lean: float) -> tuple[Estimate, Estimate | None]:
-        """The offset [pixels] and, of enough slices, the lean [columns a row] near `lean`, with their errors.
-
-        Each octave of orders gives its own; how they scatter says what noise alone does not (light that drifts, matter
-        beyond the field). Errors: `InputError` where none of them has an optimum.
-        """
-        places, slopes = [], []
-        for octave in np.unique(self.octaves):
-            leans, curves = self._curves(self.octaves == octave, lean)
-            best = int(curves.min(1).argmin())
-            places.append(minimum(self.offsets, curves[best]))
-            slopes.append(minimum(leans, curves.min(1)) if len(leans) > 1 else None)
-        places, slopes = ([each for each in found if each is not None] for found in (places, slopes))
-        require(bool(places), "the projections tell no axis; check the angles, or say where it is by --axis-column.")
-        offset = combined(*np.array(places).T)
-        return offset, combined(*np.array(slopes).T) if slopes else None
-
-    def _curves(self, orders: np.ndarray, lean: float) -> tuple[np.ndarray, np.ndarray]:
-        """Leans [L] about `lean`, and minus the logarithms of the likelihood [L, T] of offsets with each of them.
-
-        Each order has a noise of its own, the same in all slices, which is not known: it is eliminated.
-        """
-        table, heights = self.unexplained[:, orders], self.heights
-        half = 0.5 * float(np.ptp(heights)) if len(heights) >= FEWEST_SLICES else 0.0
-        step = self.offsets[1] - self.offsets[0]
-        leans = np.array([lean]) if half == 0 else lean + np.arange(-LEANS, LEANS + 1) * step / half
-        count = len(heights) * self.freedom[orders]
-        curves = []
-        for slope in leans:
-            sums = np.zeros(table.shape[:2])
-            for b, height in enumerate(heights):
-                sums += shifted(table[..., b], slope * height / step)
-            curves.append(0.5 * (count * np.log(sums)).sum(1))
-        return leans, np.array(curves)
-
-
-def shifted(table: np.ndarray, by: float) -> np.ndarray:
-    """Rows [T, N] of a table at `t + by`, linear between rows; beyond its ends, as there."""
-    at = np.clip(np.arange(len(table)) + by, 0, len(table) - 1)
-    low = np.minimum(at.astype(int), len(table) - 2)
-    share = (at - low)[:, None]
-    return (1 - share) * table[low] + share * table[low + 1]
-
-
-def minimum(places: np.ndarray, curve: np.ndarray) -> tuple[float, float] | None:
-    """The minimum of a curve through a parabola, and its standard error; None at an end, or where it does not bend."""
-    best = int(curve.argmin())
-    if not 0 < best < len(curve) - 1:
-        return None
-    left, middle, right = curve[best - 1 : best + 2]
-    step, bend = places[1] - places[0], left - 2 * middle + right
-    if bend <= 0:
-        return None
-    return float(places[best] + 0.5 * step * (left - right) / bend), float(step / np.sqrt(bend))

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     import numpy as np
 
     from ..align import AlignedViews, Calibrated, PoseOptions, PosePrior
-    from ..matter import MaterialPrior
     from ..mesh import TriangleMesh
     from ..scan import Exposures
 
@@ -150,7 +149,7 @@ def align(
     if axis_only:
         with ProgressBar() as bar:
             light, show = illumination.options(), bar.of("axis")
-            axis = find_axis(measured, ratio=_ratio(prior), light=light, on_progress=show)
+            axis = find_axis(measured, prior=prior, light=light, on_progress=show)
         lines, exposures = axis.lines(), axis.applied(measured.exposures)
     else:
         tall = heightened(measured)
@@ -168,10 +167,11 @@ def align(
     if geometry_out is not None:
         told = errors if errors is None else errors[lasting]
         _write_geometry(geometry_out, scan, reading, (measured.exposures[lasting], exposures[lasting]), told, lines[0])
+    same = exposures is measured.exposures
     facts = measured.provenance | {"aligned": lines[0]}
     light = measured.light if frames is measured.source else None  # that of frames which were turned back is not known
     write_scan(out, Scan.of(frames, exposures, measured.is_test, facts, light, missing))
-    say(f"wrote {out}: the same {len(measured)} frames, with other exposures")
+    say(f"wrote {out}: the same {len(measured)} frames, with {'the same' if same else 'other'} exposures")
 
 
 def _write_geometry(
@@ -217,17 +217,6 @@ def _write_table(path: Path, found: AlignedViews) -> None:
         [v, *(f"{value:.6g}" for value in (*found.changes[v], *found.errors[v], *ends))] for v, ends in enumerate(last)
     )
     write_rows(path, header, rows)
-
-
-def _ratio(prior: MaterialPrior) -> float | None:
-    """δ/β, where it is known and positive."""
-    from ..matter import Known, KnownRatio
-
-    if isinstance(prior, KnownRatio):
-        return prior.ratio
-    if isinstance(prior, Known) and prior.materials[0].beta > 0:
-        return prior.materials[0].ratio
-    return None
 
 
 @checked_dataclass

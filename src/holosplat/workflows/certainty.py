@@ -154,7 +154,9 @@ def _other_sign(scan: Scan, again: Again) -> tuple[Scan, Mapping[str, Any]]:
 
 
 def _axis(scan: Scan, again: Again) -> tuple[Scan, Mapping[str, Any]]:
-    return replace(scan, exposures=find_axis(scan.train()).applied(scan.exposures)), {}
+    axis = find_axis(scan.train())
+    require(not axis.stays, "the axis is where the scan says.")
+    return replace(scan, exposures=axis.applied(scan.exposures)), {}
 
 
 def _turned(angles: Callable[[np.ndarray], np.ndarray]) -> Change:

@@ -203,12 +203,16 @@ def judge_run(found: Stored, fit: Running | None, task: Task, oversample: int) -
 
 def _about_another_axis(found: Verdict, frames: Scan) -> Verdict:
     """The verdict with the axis of rotation as the likeliest cause, where projections tell for sure that it is
-    elsewhere: matter that was fitted about a wrong one has followed it, so that the residual does not show it."""
+    elsewhere, and unseen views do not refute it: matter that was fitted about a wrong one has followed it, so that the
+    residual does not show it."""
+    if frames.is_series:
+        return found
     try:
-        offset = find_axis(frames).offset
+        axis = find_axis(frames)
     except InputError:  # no common axis, or nothing to tell it by
         return found
-    if frames.is_series or abs(offset.value) < LARGE["shift_x"] or not offset.compared("another axis").wins:
+    offset = axis.offset
+    if axis.stays or abs(offset.value) < LARGE["shift_x"] or not offset.compared("another axis").wins:
         return found
     reason = (
         f"Likely cause: the axis of rotation is {abs(offset.value):.2g} ± {offset.error:.1g} px to the "
