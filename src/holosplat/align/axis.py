@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from ..baselines.material import LIKELY_RATIOS
 from ..checks import InputError, at_least, in_range, require
 from ..frames import evenly
 from ..geometry import rotation_y
@@ -191,13 +192,14 @@ def _ratio(prior: MaterialPrior) -> float | None:
 
 
 def _judged(axis: Axis, scan: Scan, prior: MaterialPrior, light: LightOptions) -> Axis:
-    """The axis as views set aside judge it, by volumes of the others about it and about the one of `scan`, each of the
-    material that fits it: a wrong axis tells a wrong one."""
+    """The axis as views set aside judge it, by volumes of the others about it and about the one of `scan`. Where δ/β is
+    not known, matter that hardly absorbs stands for it about both, for a wrong axis tells a wrong one."""
     voxel, some = coarse_binning(scan), evenly(len(scan), PICTURE_VIEWS)
     tilted = axis.leans and axis.lean is not None and abs(axis.lean.value) * scan.views.shape[0] > voxel
     if 2 * abs(axis.offset.value) <= voxel and not tilted:
         return axis
     given, frames = scan.exposures, in_even_light(scan[some], light)
+    prior = prior if prior.fixes_ratio else prior.with_ratio(LIKELY_RATIOS[1])
     placed = {GIVEN: given, FOUND: axis._moved(given, axis.leans and not tilted)}
     if tilted:
         placed[LEANING] = axis._moved(given, True)
