@@ -102,7 +102,7 @@ def once(memory: Once) -> Iterator[None]:
         two = both_sides(first)
         return FirstVolumes(two.folds, with_sign(two.prior, (made,)), two.on_progress, two.options), made
 
-    def ratio(first: FirstVolumes) -> Decision:
+    def ratio(first: FirstVolumes) -> tuple[float, Decision]:
         key = ("ratio", *of(first.folds.scan), first.prior, first.options)
         return memory.answer(key, lambda told: unseen_ratio(replace(first, on_progress=told)), first.on_progress)
 

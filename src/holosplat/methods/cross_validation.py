@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import TypeVar
 
 import numpy as np
@@ -211,13 +212,13 @@ class FirstVolumes:
         if self._material is None:
             prior = self.prior
             if self._ratio or not prior.fixes_ratio:
-                prior = prior.with_ratio(self._ratio or float(self.ratio.choice))
+                prior = prior.with_ratio(self._ratio or self.ratio[0])
             self._material = assumed_material(self.folds.scan, prior, self.on_progress, self.options.backend)
         return self._material
 
     @property
-    def ratio(self) -> Decision:
-        """δ/β of matter of which nothing is known (`unseen_ratio`)."""
+    def ratio(self) -> tuple[float, Decision]:
+        """δ/β of matter of which nothing is known (`unseen_ratio`), and the decision that it comes from."""
         return self.once("ratio", 0, lambda: unseen_ratio(self))
 
     def at_ratio(self, ratio: float) -> FirstVolumes:
@@ -259,14 +260,16 @@ class FirstVolumes:
         return retrieved(self.folds.scan, self.material, self._how, self.on_progress)
 
 
-def unseen_ratio(first: FirstVolumes) -> Decision:
-    """δ/β whose volumes of frames as measured predict unseen ones better than those of any larger one of `RATIOS` do.
+def unseen_ratio(first: FirstVolumes) -> tuple[float, Decision]:
+    """δ/β whose volumes of frames as measured predict unseen ones better than those of any larger one of `RATIOS` do;
+    by a parabola through their residuals, between this and those beside it.
 
     The null is the largest, of matter that absorbs least, for absorption may also stand for what else the model lacks.
     Where there is no matter of a ratio, its prediction is even light.
     """
     tried = {f"{ratio:.6g}": first.at_ratio(ratio) for ratio in RATIOS}
 
+    @cache
     def score(name: str, fold: int) -> Score:
         try:
             return tried[name].as_measured(fold)
@@ -274,7 +277,15 @@ def unseen_ratio(first: FirstVolumes) -> Decision:
             return without_matter(first, fold)
 
     first.on_progress(STAGE, 0.0)
-    return select(STAGE, tuple(tried), score, first.folds.count, by=first.folds.by)
+    decision = select(STAGE, tuple(tried), score, first.folds.count, by=first.folds.by)
+    at = list(tried).index(decision.choice)
+    if not 0 < at < len(tried) - 1:
+        return RATIOS[at], decision
+    near = [Score.joined([score(name, k) for k in range(first.folds.count)]) for name in list(tried)[at - 1 : at + 2]]
+    larger, smaller = (near[1].gain_over(near[k])[0] for k in (0, 2))
+    bend = larger + smaller
+    offset = float(np.clip(0.5 * (larger - smaller) / bend, -1, 1)) if bend > 0 else 0.0
+    return RATIOS[at] * (RATIOS[1] / RATIOS[0]) ** offset, decision
 
 
 def assumed_material(
@@ -295,7 +306,7 @@ def assumed_material(
     if isinstance(prior, KnownRatio):
         ratio = prior.ratio
     else:
-        ratio = float(FirstVolumes(Folds.of(scan), prior, on_progress).ratio.choice)
+        ratio, _ = FirstVolumes(Folds.of(scan), prior, on_progress).ratio
     delta = estimate_delta(scan, ratio, on_progress, backend, options, prior.delta_sign, prior.two_sided)
     return DeltaBeta(delta, delta / ratio)
 

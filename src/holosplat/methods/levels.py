@@ -177,7 +177,7 @@ def decide_ratio(
         return first, ()
     there = first.at_ratio(found.value)
     there.once(("ratio", first.taken), 0, lambda: (found, decision))
-    return there, (first.ratio, decision)
+    return there, (first.ratio[1], decision)
 
 
 def _ratio(
