@@ -236,21 +236,25 @@ def test_light_that_the_frames_of_a_later_fold_do_not_show_adds_nothing_there(sh
 
 
 @pytest.mark.parametrize(
-    ("method", "prior", "is_asked"),
+    ("method", "prior", "is_asked", "is_likely"),
     [
-        (Auto(), MaterialPrior.unknown(1), True),
-        (SmoothVolume(), MaterialPrior.unknown(1), True),
-        (None, MaterialPrior.unknown(1), False),
-        (Auto(), PRIOR, False),
-        (Auto(), MaterialPrior.unknown().on_both_sides(), False),
+        (Auto(), MaterialPrior.unknown(1), True, True),
+        (SmoothVolume(), MaterialPrior.unknown(1), True, True),
+        (None, MaterialPrior.unknown(1), True, False),
+        (Auto(), PRIOR, False, False),
+        (Auto(), MaterialPrior.unknown().on_both_sides(), False, False),
     ],
     ids=["default", "volume", "no method", "ratio told", "both sides"],
 )
-def test_absorption_is_decided_before_light_where_nothing_is_known(soft, method, prior, is_asked, monkeypatch):
+def test_absorption_is_decided_before_light_where_nothing_is_known(
+    soft, method, prior, is_asked, is_likely, monkeypatch
+):
+    """By the likelihood, too, for methods of which a fit may be made."""
     order, decision = list[str](), Decision("δ/β", "700", "views set aside")
 
-    def found(task, first):
+    def found(task, first, light, likely):
         order.append("ratio")
+        assert likely is is_likely
         return first.at_ratio(700.0), (decision,)
 
     def lit(first, *_):
