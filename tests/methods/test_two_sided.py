@@ -225,7 +225,7 @@ def test_frames_are_left_alone_where_both_sides_explain_them_as_well(bodies, mon
     """Light that was taken beside matter of one side stays where it predicts more than matter of both does."""
 
     def score(trials: Trials, name: str, fold: int) -> Score:
-        prior = trials._first.prior
+        prior = trials.first.prior
         power = even if prior.spherical else both if prior.two_sided else lit if name == "uneven light" else even
         return Score(np.full((8, 3), 9.0 if WITHOUT in name else power), 2)
 
