@@ -17,11 +17,11 @@ from holosplat.geometry import Views
 from holosplat.inference import Decision, Score
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import Auto, SmoothVolume, Task, trials
-from holosplat.methods.cross_validation import BY_FISSION, BY_VIEWS, FirstVolumes, Folds
+from holosplat.methods.cross_validation import BY_FISSION, BY_VIEWS, FirstVolumes, Folds, plain_light
 from holosplat.methods.illumination import STAGE, prepared, shows_matter
 from holosplat.methods.levels import SHOWN
 from holosplat.methods.method import first_of_task
-from holosplat.methods.trials import NULL, UNEVEN, WITHOUT, Trials, plain_light, with_more
+from holosplat.methods.trials import NULL, UNEVEN, WITHOUT, Trials, with_more
 from holosplat.optics.background import FLUX, Background, Light, LightOptions
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.red_cells import random_cells

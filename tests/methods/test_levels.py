@@ -18,7 +18,7 @@ from holosplat.geometry import Grid, Views
 from holosplat.inference import Decision, Score
 from holosplat.matter import DeltaBeta, MaterialPrior, Matter
 from holosplat.methods import Auto, Gaussians, Method, Task, settled
-from holosplat.methods.cross_validation import MissingMatter
+from holosplat.methods.cross_validation import MissingMatter, plain_light
 from holosplat.methods.levels import (
     CONTINUOUS,
     LEVELS,
@@ -28,7 +28,7 @@ from holosplat.methods.levels import (
     flattened,
 )
 from holosplat.methods.method import first_of_task
-from holosplat.methods.trials import WITHOUT, plain_light
+from holosplat.methods.trials import WITHOUT
 from holosplat.methods.uncertain import Determined
 from holosplat.optics.background import LightOptions
 from holosplat.representations import Stored, VoxelGrid
@@ -256,6 +256,25 @@ def test_the_kind_that_is_told_is_taken(sharp):
     two = MaterialPrior.known(DeltaBeta(2e-7, 1e-10), DeltaBeta(1e-7, 1e-10))
     with pytest.raises(InputError, match="--matter must be levels or auto where several materials are known"):
         settled(SMALL, Task(sharp, two), "continuous")
+
+
+def test_fits_of_gaussians_decide_the_kind_of_a_known_material(soft, monkeypatch):
+    """First volumes alone call cells in few views continuous; each kind has a fit of its own."""
+    asked, place = list[tuple[str, str]](), import_module("holosplat.methods.levels")
+    Grid.of_views(soft.views)
+
+    def fitted(method, task) -> VoxelGrid:
+        asked.append((method.kind, task.matter))
+        return VoxelGrid(
+            torch.zeros((1, *Grid.of_views(soft.views).shape)), Grid.of_views(soft.views), Matter.one(*MATERIAL)
+        )
+
+    monkeypatch.setattr(place, "solve_stages", fitted)
+    known = Task(soft, MaterialPrior.known(MATERIAL), lit=plain_light(torch.from_numpy(soft.frames), LightOptions()))
+    assert place.decide_matter(known).choice == CONTINUOUS
+    found = settled(Gaussians(), known)
+    assert found.matter == "levels"
+    assert set(asked) == {("gaussians", "levels"), ("gaussians", "continuous")}
 
 
 def test_auto_takes_bodies_for_levels_and_a_volume_for_a_continuum(soft, sharp):

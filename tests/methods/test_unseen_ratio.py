@@ -15,6 +15,7 @@ from holosplat.geometry import Views
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import Task
 from holosplat.methods.cross_validation import FirstVolumes
+from holosplat.methods.illumination import prepared
 from holosplat.methods.levels import decide_ratio, ratio_of_one
 from holosplat.methods.method import first_of_task
 from holosplat.methods.uncertain import Determined
@@ -23,6 +24,7 @@ from holosplat.scan import Exposures, Scan
 from holosplat.specimens.red_cells import random_cells
 from holosplat.specimens.scene import MeshScene
 from holosplat.specimens.soft_matter import soft_cells
+from holosplat.workflows.preconditions import decided_before, decisions_of
 
 MATERIAL = DeltaBeta(4e-7, 4e-7 / 1500)
 PIXEL, SHAPE = 1.4e-6, (33, 38)  # rectangular, and odd
@@ -106,10 +108,29 @@ def test_first_volumes_decide_where_the_likelihood_tells_none_or_is_not_asked(mo
     assert alone.material.ratio == pytest.approx(volumes.ratio[0])
 
 
-def test_absorption_must_predict_more_than_the_light_that_other_matter_calls_for(soft, monkeypatch):
-    """Frames of unequal flux pass for matter that absorbs, as long as their light is even."""
+def in_unequal_flux(scan: Scan) -> Scan:
+    """Frames that pass for those of matter that absorbs, as long as their light is even."""
     flux = 1 + 0.02 * (-1.0) ** np.arange(9)[:, None, None]
-    task = Task(replace(soft, frames=(soft.frames * flux).astype(np.float32)), MaterialPrior.unknown(1))
+    return replace(scan, frames=(scan.frames * flux).astype(np.float32))
+
+
+def test_a_run_that_goes_on_has_the_ratio_that_was_decided(soft):
+    """And so the same light: that of frames as they were measured may be another one."""
+    task = Task(in_unequal_flux(soft), MaterialPrior.unknown(1))
+    assert first_of_task(task).ratio[0] < 0.5 * LIKELY_RATIOS[1]
+    done = prepared(task)
+    again = prepared(task, before=decided_before(decisions_of(done)))
+    assert done.first is not None
+    assert again.first is not None
+    assert done.first.taken == again.first.taken != ()
+    assert done.first.material == again.first.material
+    assert done.first.material.ratio == pytest.approx(LIKELY_RATIOS[1])
+    assert np.array_equal(done.scan.frames, again.scan.frames)
+    assert {each.name for each in done.decisions} == {each.name for each in again.decisions}
+
+
+def test_absorption_must_predict_more_than_the_light_that_other_matter_calls_for(soft, monkeypatch):
+    task = Task(in_unequal_flux(soft), MaterialPrior.unknown(1))
     monkeypatch.setattr(import_module("holosplat.methods.levels"), "likeliest_ratio", lambda task: likely(300.0))
     asked = list[FirstVolumes]()
 

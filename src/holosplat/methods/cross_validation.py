@@ -108,7 +108,7 @@ EFFORT = 0.2
 CHECKED = 4
 """Edge of the squares [pixels], in which unknown light of unseen frames is fitted and tested in turns."""
 
-STAGE = "δ/β of first volumes"
+UNSEEN_RATIO = "δ/β of first volumes"
 
 T = TypeVar("T")
 
@@ -160,7 +160,7 @@ class Folds:
     @classmethod
     def of(cls, train: Scan, binning: int | None = None, fewest: int = FEWEST) -> Folds:
         """Of training frames; of several times, of those in the middle. binning: of pixels along an edge; None: as many
-        as leave coarse frames;        fewest: views from which on some are set aside."""
+        as leave coarse frames; fewest: views from which on some are set aside."""
         train = train.at_instant(len(train.instants) // 2) if train.is_series else train
         binning, views = binning or coarse_binning(train), len(train)
         by, most = (BY_FISSION, 1) if views < fewest else (BY_VIEWS, MOST if views >= MANY else views)
@@ -276,8 +276,8 @@ def unseen_ratio(first: FirstVolumes) -> tuple[float, Decision]:
         except InputError:  # there is no such matter
             return without_matter(first, fold)
 
-    first.on_progress(STAGE, 0.0)
-    decision = select(STAGE, tuple(tried), score, first.folds.count, by=first.folds.by)
+    first.on_progress(UNSEEN_RATIO, 0.0)
+    decision = select(UNSEEN_RATIO, tuple(tried), score, first.folds.count, by=first.folds.by)
     at = list(tried).index(decision.choice)
     if not 0 < at < len(tried) - 1:
         return RATIOS[at], decision
@@ -285,7 +285,7 @@ def unseen_ratio(first: FirstVolumes) -> tuple[float, Decision]:
     larger, smaller = (near[1].gain_over(near[k])[0] for k in (0, 2))
     bend = larger + smaller
     offset = float(np.clip(0.5 * (larger - smaller) / bend, -1, 1)) if bend > 0 else 0.0
-    return RATIOS[at] * (RATIOS[1] / RATIOS[0]) ** offset, decision
+    return float(f"{RATIOS[at] * (RATIOS[1] / RATIOS[0]) ** offset:.4g}"), decision
 
 
 def assumed_material(

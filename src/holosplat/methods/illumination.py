@@ -26,10 +26,10 @@ from .auto import Auto
 from .continued import Continued
 from .contrast import STAGE as SIGN
 from .contrast import Scoring, decide_sides, decide_sign, with_sign
-from .cross_validation import BY_FISSION, EFFORT, FirstVolumes, assumed_material, predicted_frames
-from .levels import SHOWN, TrialFits, blind, decide_ratio
+from .cross_validation import BY_FISSION, EFFORT, FirstVolumes, assumed_material, plain_light, predicted_frames
+from .levels import SHOWN, TrialFits, at_decided, blind, decide_ratio
 from .method import Method, Task, first_of_task, one_material
-from .trials import UNEVEN, WITHOUT, Hypothesis, Trials, name_of, named, plain_light, rivals, with_more
+from .trials import UNEVEN, WITHOUT, Hypothesis, Trials, name_of, named, rivals, with_more
 from .volume import SmoothVolume
 
 STAGE = "light and noise"
@@ -171,7 +171,7 @@ def prepared(task: Task, method: Method | None = None, before: Prepared | None =
         if options.noise == "correlated":
             first.taken = (*first.taken, "correlated noise")
     else:
-        first = replace(first, prior=task.prior)
+        first = at_decided(replace(first, prior=task.prior), before[1])
         first.taken, made = before[0], tuple(each for each in before[1] if each.name != SIGN)
     task = replace(task, decisions=(*task.decisions, *made), first=first)
     scan, light = _applied(task, light, first.taken)

@@ -175,7 +175,7 @@ def decide_ratio(
     found, decision = _ratio(task, first, lit, likely)
     if decision is None:
         return first, ()
-    there = first.at_ratio(found.value)
+    there = at_decided(first, [decision])
     there.once(("ratio", first.taken), 0, lambda: (found, decision))
     return there, (first.ratio[1], decision)
 
@@ -194,6 +194,7 @@ def _compared(task: Task, first: FirstVolumes, lit: Lit | None, likely: bool) ->
     most = LIKELY_RATIOS[1]
     if first.taken:
         return found, None
+    found = replace(found, value=float(f"{found.value:.4g}"))  # as the decision names it, so that runs may go on
     tried = {f"{each.value:.4g}": each for each in (replace(found, value=most, high=most, told=False), found)}
     trials = {name: Trials(first.at_ratio(each.value), task.light) for name, each in tried.items()}
     null, *others = tried
@@ -210,6 +211,14 @@ def _compared(task: Task, first: FirstVolumes, lit: Lit | None, likely: bool) ->
     decision = select(RATIO, tuple(tried), scored, first.folds.count, by=first.folds.by, beside=beside)
     chosen = tried[decision.choice]
     return (chosen if chosen.told or not likely else replace(chosen, remark=decision.line)), decision
+
+
+def at_decided(first: FirstVolumes, decisions: Iterable[Decision]) -> FirstVolumes:
+    """First volumes at the δ/β that `decide_ratio` has found, if it was asked."""
+    for each in decisions:
+        if each.name == RATIO:
+            first = first.at_ratio(float(each.choice))
+    return first
 
 
 def blind(decisions: Iterable[Decision]) -> bool:

@@ -15,8 +15,9 @@ from ..io.provenance import sha256
 from ..methods import Method, Task
 from ..methods.continued import Continued
 from ..methods.contrast import STAGE as SIGN
+from ..methods.cross_validation import UNSEEN_RATIO
 from ..methods.illumination import STAGE, Prepared
-from ..methods.levels import SHOWN
+from ..methods.levels import RATIO, SHOWN
 from ..methods.presets import SCHEMA
 from ..methods.uncertain import Uncertain
 from ..optics.background import LightOptions
@@ -81,10 +82,10 @@ def _without_backends(table: Any) -> None:
 
 
 def decisions_of(task: Task) -> dict[str, Any]:
-    """Entries of config.json that `decided_before` reads: what was decided of sign, light and noise, before the
-    matter."""
+    """Entries of config.json that `decided_before` reads: what was decided of sign, δ/β, light and noise, before
+    the kind of matter."""
     taken = () if task.first is None else task.first.taken
-    made = [each.as_dict() for each in task.decisions if each.name in (SIGN, STAGE, SHOWN)]
+    made = [each.as_dict() for each in task.decisions if each.name in (SIGN, UNSEEN_RATIO, RATIO, STAGE, SHOWN)]
     return {"light": list(taken), "decisions": made}
 
 
