@@ -261,13 +261,11 @@ def test_the_kind_that_is_told_is_taken(sharp):
 def test_fits_of_gaussians_decide_the_kind_of_a_known_material(soft, monkeypatch):
     """First volumes alone call cells in few views continuous; each kind has a fit of its own."""
     asked, place = list[tuple[str, str]](), import_module("holosplat.methods.levels")
-    Grid.of_views(soft.views)
+    grid = Grid.of_views(soft.views)
 
     def fitted(method, task) -> VoxelGrid:
         asked.append((method.kind, task.matter))
-        return VoxelGrid(
-            torch.zeros((1, *Grid.of_views(soft.views).shape)), Grid.of_views(soft.views), Matter.one(*MATERIAL)
-        )
+        return VoxelGrid(torch.zeros((1, *grid.shape)), grid, Matter.one(*MATERIAL))
 
     monkeypatch.setattr(place, "solve_stages", fitted)
     known = Task(soft, MaterialPrior.known(MATERIAL), lit=plain_light(torch.from_numpy(soft.frames), LightOptions()))
