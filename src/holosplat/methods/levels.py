@@ -31,7 +31,7 @@ STAGE = "levels or continuous matter"
 SHOWN = "matter in first volumes"
 NAME, RATIO = "matter", "δ/β in frames as measured"
 LEVELS = ("one level", "two levels")
-IN_LIGHT = " in the light that it calls for"
+IN_LIGHT = "in the light that each calls for"
 SEVERAL = "several levels"
 CONTINUOUS = "continuous"
 
@@ -168,9 +168,9 @@ def decide_ratio(
 
     The null is the largest of `LIKELY_RATIOS`, of matter that absorbs least. The likeliest one (`likeliest_ratio`), or
     where the likelihood tells none, or is not asked (`likely`), that of `FirstVolumes.ratio`, is taken where first
-    volumes of such matter predict unseen frames better than those of the null do, as measured and in the light that
-    these call for (`lit`): what explains frames by absorption may be whatever else the model lacks. In light or noise
-    that was taken, which were found at the first δ/β, nothing is decided.
+    volumes of such matter predict unseen frames better than those of the null do, as measured, and both in the light
+    that each calls for (`lit`): absorption may stand for light, and light for absorption. In light or noise that was
+    taken, which were found at the first δ/β, nothing is decided.
     """
     found, decision = _ratio(task, first, lit, likely)
     if decision is None:
@@ -197,18 +197,19 @@ def _compared(task: Task, first: FirstVolumes, lit: Lit | None, likely: bool) ->
     found = replace(found, value=float(f"{found.value:.4g}"))  # as the decision names it, so that runs may go on
     tried = {f"{each.value:.4g}": each for each in (replace(found, value=most, high=most, told=False), found)}
     trials = {name: Trials(first.at_ratio(each.value), task.light) for name, each in tried.items()}
-    null, *others = tried
 
-    def scored(name: str, fold: int) -> Score:
-        one, within, _ = name.partition(IN_LIGHT)
-        hypothesis = lit(trials[one].first) if within and lit else ()
-        try:
-            return trials[one].score(name_of(hypothesis), fold)
-        except InputError:  # there is no such matter
-            return without_matter(first, fold)
+    def decided(light: Mapping[str, Hypothesis], by: str) -> Decision:
+        def scored(name: str, fold: int) -> Score:
+            try:
+                return trials[name].score(name_of(light.get(name, ())), fold)
+            except InputError:  # there is no such matter
+                return without_matter(first, fold)
 
-    beside = {other: (null + IN_LIGHT,) for other in others if lit}
-    decision = select(RATIO, tuple(tried), scored, first.folds.count, by=first.folds.by, beside=beside)
+        return select(RATIO, tuple(tried), scored, first.folds.count, by=by)
+
+    decision = decided({}, first.folds.by)
+    if lit and tried[decision.choice].value != most:
+        decision = decided({name: lit(each.first) for name, each in trials.items()}, f"{first.folds.by}, {IN_LIGHT}")
     chosen = tried[decision.choice]
     return (chosen if chosen.told or not likely else replace(chosen, remark=decision.line)), decision
 
