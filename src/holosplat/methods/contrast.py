@@ -131,10 +131,12 @@ def _refuted(volumes: Mapping[str, FirstVolumes], light: LightOptions, told: Hyp
 
 
 def both_sides(first: FirstVolumes) -> FirstVolumes:
-    """The same of matter on both sides of its medium, with the usual steps, for no bound makes them end sooner."""
+    """The same, of the same δ/β, of matter on both sides of its medium, with the usual steps, for no bound makes them
+    end sooner."""
     usual = HolographicTV()
     how = replace(first.options, retrieval=usual.retrieval, iterations=usual.iterations)
-    return FirstVolumes(first.folds, first.prior.on_both_sides(), first.on_progress, how)
+    both = FirstVolumes(first.folds, first.prior.on_both_sides(), first.on_progress, how)
+    return both if both.prior.fixes_ratio else both.at_ratio(first.material.ratio)
 
 
 def with_sign(prior: MaterialPrior, decisions: Sequence[Decision]) -> MaterialPrior:

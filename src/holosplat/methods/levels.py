@@ -22,7 +22,15 @@ from ..checks import InputError, NoMatterError
 from ..inference import Decision, Score, select
 from ..matter import MatterKind
 from ..representations import Stored, VoxelGrid
-from .cross_validation import BY_FISSION, EFFORT, FirstVolumes, predictions, without_matter
+from ..tables import with_entries
+from .cross_validation import (
+    BRIEF,
+    BY_FISSION,
+    EFFORT,
+    FirstVolumes,
+    predictions,
+    without_matter,
+)
 from .method import Method, Task, first_of_task, solve_stages
 from .trials import WITHOUT, Hypothesis, Trial, Trials, accepted, hypothesis_of, name_of
 from .uncertain import Determined, likeliest_ratio
@@ -115,12 +123,13 @@ class _FlatVolumes:
 class TrialFits:
     """Fits of the methods for either kind of matter to coarse frames, under hypotheses about light and noise.
 
-    Two levels alone need no ratio δ/β; else it is, where nothing is known, the likeliest one, as in a run; before light
-    is decided, that of the first volume.
+    They start from volumes as brief as first ones (`BRIEF`). Two levels alone need no ratio δ/β; else it is, where
+    nothing is known, the likeliest one, as in a run; before light is decided, that of the first volume.
     """
 
     def __init__(self, task: Task, first: FirstVolumes, methods: Mapping[MatterKind, Method]) -> None:
-        self._task, self._first, self._methods = task, first, methods
+        self._task, self._first = task, first
+        self._methods = {kind: with_entries(method, BRIEF) for kind, method in methods.items()}
         self._trials = Trials(first, task.light)
 
     def score(self, name: str, kind: MatterKind, fold: int, two: bool = False) -> Score:
@@ -147,6 +156,7 @@ class TrialFits:
             ratio = ratio_of_one(task, self._first).value if known else self._first.material.ratio
             prior = prior.with_ratio(ratio)
         fitted = replace(task, scan=seen, prior=prior, lit=trial.light, matter=kind, first=None)
+        fitted = replace(fitted, first=first_of_task(fitted).at_ratio(self._first.material.ratio))
         if fitted.bounded and not prior.materials and "continuous" in self._methods:
             volume = self._fit(hypothesis, "continuous", fold)
             fitted = replace(fitted, likeliest=volume if isinstance(volume, VoxelGrid) else None)
