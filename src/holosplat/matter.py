@@ -175,7 +175,7 @@ class MaterialPrior:
     sign: Sign = 0
     """1 where δ of the matter lies above its medium's, -1 where it lies below, 0 where that is not known."""
     two_sided: bool = False
-    """Whether δ of continuous matter may lie on both sides of its medium's."""
+    """Whether δ of matter may lie on both sides of its medium's."""
     spherical: bool = False
     """Whether continuous matter is spherical about a point that is not known, as a shock from there."""
     medium: str = ""
@@ -218,7 +218,9 @@ class MaterialPrior:
 
     def on_both_sides(self) -> MaterialPrior:
         """The same knowledge of continuous matter on both sides of its medium. Errors: `InputError` for several
-        materials."""
+        materials on one."""
+        if self.two_sided:
+            return self
         one = len(self.materials) < 2
         require(one, "matter on both sides of its medium must be of one --material, but there are several; give one.")
         return replace(self, two_sided=True)  # type: ignore[type-var]  # every kind is a dataclass
@@ -308,19 +310,19 @@ class KnownSeveral(MaterialPrior):
         deltas = [material.delta for material in self.materials]
         listed = ", ".join(f"{delta:.3g}" for delta in deltas)
         require(
-            min(deltas) * max(deltas) > 0,
-            "materials must all have δ above their medium's, or all below, but the differences are "
-            f"{listed}; give the medium that lies on one side of all, or fewer materials.",
-        )
-        require(
             len(set(deltas)) == len(deltas),
             f"materials are told apart by δ, but theirs are {listed}; take those that are alike for one.",
         )
 
     @property
     def sign(self) -> Sign:  # type: ignore[override]
-        """That of δ of all."""
+        """That of δ of the first."""
         return -1 if self.materials[0].delta < 0 else 1
+
+    @property
+    def two_sided(self) -> bool:  # type: ignore[override]
+        """Whether they lie on both sides of their medium."""
+        return any(material.delta * self.sign < 0 for material in self.materials)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, ready for JSON."""

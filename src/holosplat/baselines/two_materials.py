@@ -134,11 +134,22 @@ def _two_medians(values: np.ndarray) -> tuple[float, float]:
 
 
 def told_apart(delta: Tensor, levels: Sequence[float], pixel: int, options: TwoMaterials = DEFAULT) -> Tensor:
-    """Occupancies [C, Z, Y, X] of the materials of δ `levels`, the highest first, in a volume [Z, Y, X] of δ.
+    """Occupancies [C, Z, Y, X] of the materials of δ `levels`, the largest first, in a volume [Z, Y, X] of δ.
 
-    Voxels nearest to a lower level are full of its material, unless they are part of a layer thinner than about two
-    pixels: between the densest one and nothing every value occurs. All others hold the densest one in part.
+    Voxels nearest to a smaller level are full of its material, unless they are part of a layer thinner than about two
+    pixels: between the densest one and nothing every value occurs. All others hold the densest one in part. Levels on
+    either side of zero are told apart by themselves.
     """
+    found = delta.new_zeros(len(levels), *delta.shape)
+    for side in (1, -1):
+        own = [k for k, level in enumerate(levels) if side * level > 0]
+        if own:
+            found[own] = _told_apart(side * delta, [side * levels[k] for k in own], pixel, options)
+    return found
+
+
+def _told_apart(delta: Tensor, levels: Sequence[float], pixel: int, options: TwoMaterials) -> Tensor:
+    """The same of positive levels."""
     values = delta.numpy()
     edges = [0.5 * (level + below) for level, below in zip(levels, [*levels[1:], 0.0])]
     between = ((values > low) & (values <= high) for high, low in pairwise(edges))

@@ -16,7 +16,7 @@ from ..checks import require
 from ..geometry import Grid
 from ..matter import DeltaBeta
 from ..projectors.voxels import projector_for
-from ..ranges import Weight, checked_dataclass
+from ..ranges import Signed, Weight, checked_dataclass
 from .projected_gradient import direction
 from .whitened import WhitenedFrames
 
@@ -55,8 +55,8 @@ class ContinuousPrior:
     """m: exponent of the power law of values."""
     value: Weight = 0.05
     """v: distance from the nearest level beyond which the law holds, as a share of the matter's level."""
-    levels: tuple[float, ...] = ()
-    """Occupancies of the known materials, rising from above 0; none where no density is known."""
+    levels: tuple[Signed, ...] = ()
+    """Occupancies of the known materials; none where no density is known."""
     two_sided: bool = False
     """Whether u may be negative."""
 
@@ -79,7 +79,7 @@ class ContinuousPrior:
         u ≥ 0."""
         if not (self.levels or self.two_sided):
             return u, torch.ones_like(u)
-        levels = u.new_tensor([0.0, *self.levels])
+        levels = u.new_tensor(sorted([0.0, *self.levels]))
         away = u - levels[torch.bucketize(u, 0.5 * (levels[1:] + levels[:-1]))]  # of one level all are in one bucket
         size = (away.square() + epsilon**2).sqrt()
         return size - epsilon, away / size
@@ -87,7 +87,7 @@ class ContinuousPrior:
 
 @dataclass(frozen=True)
 class KnownLevels:
-    """Known materials, all of one sign of δ, in an occupancy of `unit` [δ, β]; none where no density is known."""
+    """Known materials in an occupancy of `unit` [δ, β]; none where no density is known."""
 
     materials: tuple[DeltaBeta, ...]
     unit: DeltaBeta
@@ -100,11 +100,11 @@ class KnownLevels:
     def absorbed(self, u: Tensor) -> Tensor | None:
         """β beside that of an occupancy u [Z, Y, X] of the unit, as large as between the two levels that are nearest;
         None where all matter has the unit's ratio."""
-        knots = sorted((delta / self.unit.delta, beta) for delta, beta in self.materials)
-        beside = [0.0, *(beta - level * self.unit.beta for level, beta in knots)]
+        knots = sorted([(0.0, 0.0), *((delta / self.unit.delta, beta) for delta, beta in self.materials)])
+        beside = [beta - level * self.unit.beta for level, beta in knots]
         if max(map(abs, beside)) <= ALIKE * abs(self.unit.beta):
             return None
-        at, values = u.new_tensor([0.0, *(level for level, _ in knots)]), u.new_tensor(beside)
+        at, values = u.new_tensor([level for level, _ in knots]), u.new_tensor(beside)
         right = torch.bucketize(u, at).clamp(1, len(at) - 1)
         share = ((u - at[right - 1]) / (at[right] - at[right - 1])).clamp(0, 1)
         return values[right - 1] + share * (values[right] - values[right - 1])

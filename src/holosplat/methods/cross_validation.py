@@ -302,7 +302,8 @@ def assumed_material(
     """
     if prior.materials:
         deltas, betas = zip(*prior.materials)
-        return DeltaBeta(deltas[0], deltas[0] * sum(betas) / sum(deltas)) if betas[1:] else prior.materials[0]
+        added = sum(math.copysign(beta, beta * delta) for delta, beta in prior.materials)
+        return DeltaBeta(deltas[0], deltas[0] * added / sum(map(abs, deltas))) if betas[1:] else prior.materials[0]
     if isinstance(prior, KnownRatio):
         ratio = prior.ratio
     else:

@@ -171,11 +171,12 @@ def in_turns(task: Task, found: SurfaceMesh, options: GaussianOptions, surfaces:
     A surface moves its edges, but begins no body, and follows no fringe from a few pixels away. Rounds of agreement
     that begin with its bodies (`baselines.holographic_tv.agreed`) say what is missing, or too much, elsewhere; the
     volume is cut again, and its surfaces are settled. So it goes on, at most `CoarseToFine.turns` times, as long as the
-    square of what they leave of the frames falls by `turn_gain` of it or more. Without rounds there are no turns.
+    square of what they leave of the frames falls by `turn_gain` of it or more. Without rounds, which matter on both
+    sides of its medium does not have, there are no turns.
     """
     how = options.coarse.of_views(len(task.scan.train()))
     least = _left(task, found, surfaces)
-    for _ in range(how.turns if options.volume.corrections > 0 else 0):
+    for _ in range(how.turns if options.volume.corrections > 0 and not task.prior.two_sided else 0):
         try:
             turned = settled(task, _cut_again(task, found, options, surfaces), surfaces, how)
         except InputError:  # the volume holds no surface

@@ -118,7 +118,7 @@ def prepared(task: Task, method: Method | None = None, before: Prepared | None =
         return task
     if method is not None:
         require(
-            method.two_sided or not task.prior.two_sided,
+            method.two_sided or not task.prior.two_sided or len(task.prior.materials) > 1,
             f"matter on both sides of its medium is continuous, but the method is {method.kind}, whose matter lies on "
             "one; take --method auto or volume.",
         )

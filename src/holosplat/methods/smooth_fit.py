@@ -91,7 +91,7 @@ class SmoothPlan:
     loose: float
     backend: str
     known: tuple[DeltaBeta, ...] = ()
-    """Materials that are known, of one sign of δ."""
+    """Materials that are known."""
 
     @property
     def levels(self) -> KnownLevels:

@@ -79,7 +79,7 @@ def _from_phase_retrieval(task: Task, options: GaussianOptions) -> GaussianCloud
         return holographic_tv(frames, material, how, task.on_progress, task.unlike_null)
 
     volume, grid = retrieve(scan)
-    if task.prior.two_sided:
+    if task.prior.two_sided and not task.prior.materials[1:]:
         shares = _sides(volume, grid, material, options.filled)
     else:
         shares = _shares(task, options, material, (volume, grid), retrieve)
@@ -120,7 +120,7 @@ def _shares(
     (volume, grid), scan, prior, backend = found, task.scan, task.prior, options.volume.backend
     pixel, how = round(scan.views.finest / grid.voxel_size[0]) or 1, options.two_materials
     known = prior.materials if len(prior.materials) > 1 else ()
-    levels = tuple(abs(material.delta) for material in known) or None
+    levels = tuple(material.sign * each.delta for each in known) or None
     if task.matter == "levels" and not prior.fixes_ratio and options.most_materials == 2 and not options.separate:
         levels = two_levels(volume * abs(material.delta), pixel, how)
     if levels is None:
@@ -163,7 +163,7 @@ def _random(task: Task, options: GaussianOptions) -> GaussianCloud:
     matter = Matter.one(*material) if prior.fixes_ratio else Matter.free(*material)
     if len(prior.materials) == 2:
         matter = Matter.several(*prior.materials)
-    if prior.two_sided:
+    if prior.two_sided and not prior.materials[1:]:
         matter = Matter.several(*both_sides(material))
     return random_cloud(options.random_count, scan.views, matter, thickness, task.seed)
 

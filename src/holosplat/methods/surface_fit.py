@@ -25,6 +25,7 @@ from ..fit.terms import Objective
 from ..fit.terms.object import Bending, membrane_inverse
 from ..geometry import Grid, Views
 from ..matter import Matter
+from ..mesh import TriangleMesh
 from ..optics.background import Light
 from ..optics.noise import noise_share
 from ..optics.sampling import fringe_sampling
@@ -124,14 +125,19 @@ def cut_surfaces(
     occupancy: Tensor, grid: Grid, unit_length: float, matter: Matter, options: Extraction = Extraction()
 ) -> SurfaceMesh:
     """The surfaces [`unit_length`] where occupancy [Z, Y, X] of the first material on `grid` crosses the level from
-    each material of `matter`, the strongest first, to those of weaker contrast and the medium.
+    each material of `matter`, the strongest first, to those of weaker contrast on its side of the medium, and to this.
 
     The level lies between those materials that are near: of a wall in air 0.5, though a liquid lies between both in δ.
     Errors: `InputError` if one of them has no surface.
     """
-    vertices, faces, count = list[np.ndarray](), list[np.ndarray](), 0
-    for level in _levels(occupancy, [delta / matter.delta for delta, _ in matter.channels], options.level):
-        mesh = isosurface(occupancy.numpy() / level, grid, 1.0, options.least_volume, options.smoothing)
+    vertices, faces, count, cut = list[np.ndarray](), list[np.ndarray](), 0, dict[int, TriangleMesh]()
+    for side in (1, -1):
+        own = {k: side * delta / matter.delta for k, (delta, _) in enumerate(matter.channels)}
+        own = {k: level for k, level in own.items() if level > 0}
+        for k, level in zip(own, _levels(side * occupancy, list(own.values()), options.level)):
+            share = side * occupancy.numpy() / level
+            cut[k] = isosurface(share, grid, 1.0, options.least_volume, options.smoothing)
+    for mesh in (cut[k] for k in sorted(cut)):
         vertices.append(mesh.vertices / unit_length)
         faces.append(mesh.faces + count)
         count += len(mesh.vertices)
@@ -145,8 +151,8 @@ def _levels(occupancy: Tensor, own: Sequence[float], share: float) -> Iterator[n
 
     A material but the first is near where it fills more than a layer (`told_apart`).
     """
-    if len(own) == 1:
-        yield share * own[0]
+    if len(own) < 2:
+        yield from (share * level for level in own)
         return
     filled = told_apart(occupancy, own, 1)[1:].numpy() > 0
     near = [np.asarray(binary_dilation(each, iterations=NEAR), dtype=bool) for each in filled]

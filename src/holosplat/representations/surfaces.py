@@ -28,8 +28,9 @@ class SurfaceMesh:
     counter-clockwise seen from the side without matter, so that an inner shell bounds a cavity. Bodies that overlap
     add up. matter: what is inside: shares of materials, that of the strongest contrast first. parts: how many faces
     belong to each of them (default: all to the one material), in their order. Those of a material enclose it and all
-    stronger ones, so that each closed surface is a step from one material to the next. lines: rows that are integrated
-    in a pixel of a projection. Errors: `InputError` if the arrays do not fit, or for free δ and β.
+    stronger ones on its side of the medium, so that each closed surface is a step from one material to the next. lines:
+    rows that are integrated in a pixel of a projection. Errors: `InputError` if the arrays do not fit, or for free δ
+    and β.
     """
 
     kind: ClassVar[str] = "surfaces"
@@ -128,7 +129,7 @@ class SurfaceMesh:
         sources = None if poses.sources is None else poses.sources / pitch
         edges = {"pixels": poses.scales, "sources": sources}
         enclosed = [surface_thickness(vertices, faces, *placed, **edges, trusted=trusted) for faces in self.steps]
-        return LineIntegrals(_shares(enclosed, dim=1), self.matter.in_lengths(pitch))
+        return LineIntegrals(self._shares(enclosed, dim=1), self.matter.in_lengths(pitch))
 
     def voxelise(self, grid: Grid) -> Volume:
         """δ and β on `grid`, averaged over voxels."""
@@ -139,7 +140,17 @@ class SurfaceMesh:
         voxel, offset = (self.vertices.new_tensor(a, dtype=torch.float64) for a in (grid.voxel_size, grid.origin))
         vertices = (self.vertices.detach() * self.unit_length - offset) / voxel
         enclosed = [surface_occupancy(vertices, faces, grid.shape) for faces in self.steps]
-        return _shares(enclosed, dim=0)
+        return self._shares(enclosed, dim=0)
+
+    def _shares(self, enclosed: list[Tensor], dim: int) -> Tensor:
+        """What is of each material, along a new axis `dim`, by what its surfaces enclose: it, and all on the same side
+        of the medium before it."""
+        stronger = dict[float, Tensor]()
+        found = list[Tensor]()
+        for material, one in zip(self.matter.channels, enclosed):
+            found.append(one - stronger[material.sign] if material.sign in stronger else one)
+            stronger[material.sign] = one
+        return torch.stack(found, dim=dim)
 
     def mesh(self, name: str = "surfaces") -> TriangleMesh:
         """All surfaces as one mesh [m]."""
@@ -164,12 +175,6 @@ class SurfaceMesh:
             smallest = max(range(len(outer)), key=lambda k: (around[k], k))  # outer ones are sorted by size
             members[smallest].append(cavity)
         return [joined(parts, f"body{k:03d}") for k, parts in enumerate(members)]
-
-
-def _shares(enclosed: list[Tensor], dim: int) -> Tensor:
-    """What is of each material, along a new axis `dim`, by what its surfaces enclose: it and all before it."""
-    stronger = [torch.zeros_like(enclosed[0]), *enclosed[:-1]]
-    return torch.stack([one - less for one, less in zip(enclosed, stronger)], dim=dim)
 
 
 class MovingSurfaces:
