@@ -58,8 +58,6 @@ def test_several_materials_are_the_same_in_a_file():
 def test_what_cannot_be_seen_or_told_apart_is_refused():
     with pytest.raises(InputError, match="must differ from its medium in δ, but the difference is 0"):
         MaterialPrior.known(DeltaBeta(0.0, 1e-9))
-    with pytest.raises(InputError, match="must all have δ above their medium's, or all below"):
-        MaterialPrior.known(SOFT, DeltaBeta(-5e-7, -5e-9))
     with pytest.raises(InputError, match="told apart by δ, but theirs are"):
         MaterialPrior.known(DeltaBeta(-1e-7, 0.0), DeltaBeta(-1e-7, -1e-9))
     with pytest.raises(InputError, match="sign must be -1, 0 or 1"):
@@ -67,6 +65,21 @@ def test_what_cannot_be_seen_or_told_apart_is_refused():
     assert MaterialPrior.of_ratio(1e6).ratio == 1e6
     with pytest.raises(InputError, match=r"size between 1 and 1e\+06, but it is 1\.1e\+06"):
         MaterialPrior.of_ratio(1.1e6)
+
+
+def test_known_materials_may_lie_on_both_sides_of_their_medium():
+    """The stronger one comes first, whichever side that is."""
+    holes = DeltaBeta(-2 * SOFT.delta, -5e-9)
+    both, one = (
+        MaterialPrior.known(SOFT, holes, medium="water"),
+        MaterialPrior.known(SOFT, DeltaBeta(2 * SOFT.delta, SOFT.beta)),
+    )
+    assert both.materials == (holes, SOFT)
+    assert (both.sign, both.two_sided, one.two_sided) == (-1, True, False)
+    assert both.on_both_sides() is both
+    assert prior_of(both.as_dict()) == both
+    with pytest.raises(InputError, match="must be of one --material, but there are several"):
+        one.on_both_sides()
 
 
 def test_only_where_nothing_is_known_is_the_ratio_open():

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from .benchmark import Row, markdown, read, table
 
-KINDS = ["bubbles", "cuvette", "jet", "break-up", "crack", "shock", "keyhole", "lattice", "fibres", "channel", "star"]
+KINDS = ["bubbles", "flotation", "cuvette", "jet", "break-up", "crack", "shock", "keyhole", "lattice", "fibres"]
+KINDS += ["channel", "star"]
 HEAD = {
     ("large", "told"): "12 views, no noise: told",
     ("small", "told"): "8 noisy views: told",

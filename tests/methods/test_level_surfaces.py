@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 import torch
 
+import holosplat as hs
 from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
-from holosplat.fit.smooth_volume import KnownLevels
+from holosplat.fit.smooth_volume import ContinuousPrior, KnownLevels
 from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta, MaterialPrior, Matter
-from holosplat.methods import Gaussians, Task
+from holosplat.methods import METHODS, Gaussians, Task
 from holosplat.methods import first_surfaces as levels
 from holosplat.methods.surface_fit import SurfaceOptions, cut_surfaces
 from holosplat.representations import SurfaceMesh, VoxelGrid
@@ -91,6 +92,83 @@ def test_what_known_materials_absorb_lies_between_them():
     own = [0.0, 0.5 * (LIQUID.beta - 1e-9), LIQUID.beta - 1e-9, 1e-9, 1e-9]
     np.testing.assert_allclose(beside.numpy(), own, rtol=1e-5, atol=1e-15)
     assert KnownLevels((WALL,), WALL).absorbed(torch.ones(3)) is None
+
+
+BUBBLE = DeltaBeta(-9e-7, -2e-9)
+
+
+@cache
+def both_sides() -> MeshScene:
+    """A coated ball in a liquid, and a bubble beside it."""
+    coat, ball, bubble = (
+        Ball(np.array([x, 0.5, 0.2]) * PIXEL, 2 * radius * PIXEL).mesh(3, "ball")
+        for x, radius in ((-4.5, 5.5), (-4.5, 3.4), (5.5, 3.6))
+    )
+    return MeshScene((coat, ball, bubble), (LIQUID, WALL.against(LIQUID), BUBBLE))
+
+
+@cache
+def cut_on_both_sides() -> SurfaceMesh:
+    """The surfaces of all three, of the truth."""
+    matter = Matter.several(WALL, BUBBLE, LIQUID)
+    found = torch.from_numpy(both_sides().voxelise(GRID).delta / WALL.delta).float()
+    return cut_surfaces(found, GRID, PIXEL, matter)
+
+
+def test_surfaces_on_either_side_of_the_medium_enclose_what_is_stronger_on_theirs():
+    """What lies between the wall and the liquid in strength, but on the other side, is in neither."""
+    shares, true = cut_on_both_sides().shares(GRID), both_sides().voxelise(GRID)
+    sizes = 4 / 3 * np.pi * np.array([3.4**3, 3.6**3, 5.5**3 - 3.4**3])
+    np.testing.assert_allclose(shares.sum(dim=(1, 2, 3)).numpy(), sizes, rtol=0.12)
+    assert float(shares.min()) > -1e-9
+    found = cut_on_both_sides().voxelise(GRID)
+    for mine, theirs in ((found.delta, true.delta), (found.beta, true.beta)):
+        assert np.linalg.norm(mine - theirs) < 0.15 * np.linalg.norm(theirs)
+
+
+def test_line_integrals_on_both_sides_are_those_of_each_step_alone():
+    lines, jumps = cut_on_both_sides().project(VIEWS), (WALL.against(LIQUID), BUBBLE, LIQUID)
+    alone = [
+        tuple(SurfaceMesh(cut_on_both_sides().vertices, faces, PIXEL, Matter.one(*jump)).project(VIEWS))
+        for faces, jump in zip(cut_on_both_sides().steps, jumps)
+    ]
+    for mine, *parts in zip(tuple(lines), *alone):
+        torch.testing.assert_close(mine, sum(parts), rtol=1e-9, atol=1e-18)
+
+
+def test_absorption_on_both_sides_lies_between_each_material_and_the_medium():
+    known = KnownLevels((WALL, BUBBLE), DeltaBeta(WALL.delta, 0.0))
+    assert known.occupancies == pytest.approx((-0.75, 1.0))
+    beside = known.absorbed(torch.tensor([-1.0, -0.75, -0.375, 0.0, 0.5, 1.0]))
+    assert beside is not None
+    own = [BUBBLE.beta, BUBBLE.beta, 0.5 * BUBBLE.beta, 0.0, 0.5 * WALL.beta, WALL.beta]
+    np.testing.assert_allclose(beside.numpy(), own, rtol=1e-5, atol=1e-15)
+    drawn = ContinuousPrior(two_sided=True, levels=known.occupancies).distance(torch.tensor([-0.8, -0.3, 0.4]), 1e-6)
+    np.testing.assert_allclose(drawn[0].numpy(), [0.05, 0.3, 0.4], atol=1e-5)
+    np.testing.assert_allclose(drawn[1].numpy(), [-1, -1, 1], atol=1e-4)
+
+
+@pytest.mark.parametrize(("name", "most"), [("auto", 0.12), ("gaussians", 0.2), ("volume", 0.25)])
+def test_bodies_and_bubbles_of_known_materials_are_found_together(name, most):
+    """Noise of 2000 photons a pixel, in frames of an odd rectangle; bodies on one side alone leave half of it."""
+    exposed = simulate(both_sides_of_two(), Exposures.of(Views.evenly_spaced(8, (31, 33), PIXEL), 20.0, 0.03))
+    noisy = np.random.default_rng(4).poisson(2000 * exposed.frames) / 2000
+    scan = replace(exposed, frames=noisy.astype(np.float32))
+    found = hs.reconstruct(scan, MaterialPrior.known(WALL, BUBBLE, medium="water"), METHODS[name])
+    true = both_sides_of_two().voxelise(Grid.of_views(scan.views))
+    delta = found.object.voxelise(true.grid).delta
+    assert np.linalg.norm(delta - true.delta) < most * np.linalg.norm(true.delta)
+    for mine, theirs in (
+        (delta > 0.5 * WALL.delta, true.delta > 0.5 * WALL.delta),
+        (delta < -4e-7, true.delta < -4e-7),
+    ):
+        assert 2 * (mine & theirs).sum() > 0.93 * (mine.sum() + theirs.sum())
+
+
+def both_sides_of_two() -> MeshScene:
+    bodies = (((-6.0, 2.0, 1.0), 5.5), ((6.5, -3.0, -2.0), 4.5), ((3.0, 6.0, 5.0), 4.0), ((-1.0, -7.0, 4.0), 4.0))
+    meshes = tuple(Ball(np.array(centre) * PIXEL, 2 * radius * PIXEL).mesh(3, "ball") for centre, radius in bodies)
+    return MeshScene(meshes, (WALL, BUBBLE, WALL, BUBBLE))
 
 
 def quick() -> Gaussians:

@@ -19,6 +19,7 @@ from holosplat.specimens import (
     ContinuousScene,
     Crack,
     Cuvette,
+    Flotation,
     Drawn,
     Fibres,
     Jet,
@@ -129,6 +130,18 @@ def test_bubbles_hold_the_material_against_the_medium():
     radii = found.scene.radii / SIZE
     assert (radii.min(), radii.max()) == pytest.approx((0.05, 0.14))
     assert means(found.scene) == pytest.approx(SUBSTANCES.contrast.delta * shares(found)["bubbles"], rel=1e-5)
+
+
+def test_flotation_has_matter_on_both_sides_of_its_medium():
+    """Bubbles of the material and beads of the core, apart, and of sizes that chance gives to either."""
+    gas, bead, liquid = DeltaBeta(1e-9, 1e-12), DeltaBeta(7e-7, 4e-10), DeltaBeta(3e-7, 1e-10)
+    found = Flotation(SIZE, count=3, beads=2).drawn(Substances(gas, bead, liquid), 1)
+    delta, parts = means(found.scene), shares(found)
+    expected = gas.against(liquid).delta * parts["bubbles"] + bead.against(liquid).delta * parts["beads"]
+    assert delta == pytest.approx(expected, rel=1e-5, abs=1e-12)
+    assert delta.min() < -2e-7 < 2e-7 < delta.max()
+    assert not ((parts["bubbles"] > 0.5) & (parts["beads"] > 0.5)).any()
+    assert found.text == "3 bubbles and 2 beads, seed 1"
 
 
 def test_a_cuvette_has_four_levels():

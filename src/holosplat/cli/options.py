@@ -375,8 +375,8 @@ class PriorOptions:
             return prior.on_both_sides()
         sign = 1 if self.contrast == "above" else -1
         require(
-            not prior.materials or prior.sign == sign,
-            f"--contrast must be on the side of --material, but it is {self.contrast}, and the material's δ lies on "
+            not prior.materials or (prior.sign == sign and not prior.two_sided),
+            f"--contrast must be on the side of --material, but it is {self.contrast}, and a material's δ lies on "
             "the other side of its medium's; leave --contrast.",
         )
         return prior.signed(sign)

@@ -119,6 +119,7 @@ Moving = Literal["stirred-blob", "collapsing-foam"]
 Soft = Literal["soft-cells", "round-cell", "tissue", "head-phantom", "coated-droplets", "body-with-absorber"]
 InField = Literal[
     "bubbles",
+    "flotation",
     "cuvette",
     "jet",
     "break-up",

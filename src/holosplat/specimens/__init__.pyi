@@ -20,6 +20,7 @@ from .fluids import Blast as Blast
 from .fluids import BreakUp as BreakUp
 from .fluids import Bubbles as Bubbles
 from .fluids import Cuvette as Cuvette
+from .fluids import Flotation as Flotation
 from .fluids import Jet as Jet
 from .fluids import Shock as Shock
 from .gas_waves import ExpandingShock as ExpandingShock

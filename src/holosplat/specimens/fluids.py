@@ -114,6 +114,36 @@ class Bubbles(SpecimenKind):
 
 
 @checked_dataclass
+class Flotation(SpecimenKind):
+    """Gas bubbles and solid beads, the core, in a liquid that fills the field and goes on beyond it."""
+
+    kind: ClassVar[str] = "flotation"
+    has_core: ClassVar[bool] = True
+    goes_on: ClassVar[bool] = True
+    named: ClassVar = ("air", "glass", "water")
+    extent: ClassVar[float] = 0.85
+    size: Small
+    """Diameter and height of the cylinder about the rotation axis in which they lie [m]."""
+    count: Many = 5
+    """Number of bubbles."""
+    beads: Many = 4
+    """Number of beads."""
+    radii: tuple[SomeShare, SomeShare] = (0.06, 0.13)
+    """Radii of the smallest and of the largest; the others lie evenly between them."""
+
+    def drawn(self, substances: Substances, seed: int) -> Drawn:
+        """The bubbles and beads that `seed` gives."""
+        rng, solid = np.random.default_rng(seed), substances.within(self.kind).against(substances.medium)
+        whole = (self.size, self.size, self.size)
+        balls = ball_meshes(self.count + self.beads, self.radii, self.size, whole, rng, "cylinder")
+        order = rng.permutation(len(balls))
+        bubbles, beads = ([balls[k] for k in chosen] for chosen in (order[: self.count], order[self.count :]))
+        parts = {"bubbles": region(*bubbles), "beads": region(*beads)}
+        text = f"{self.count} bubbles and {self.beads} beads, seed {seed}"
+        return Drawn(meshed([(bubbles, substances.contrast), (beads, solid)]), text, parts)
+
+
+@checked_dataclass
 class Cuvette(SpecimenKind):
     """A square tube about the rotation axis, which goes on above and below: its wall, a liquid, bubbles in that.
 

@@ -14,14 +14,16 @@ from ..ranges import Many, Seed, Share, Small, SomeShare, checked_dataclass
 from .changing import Collapse, CrushedLattice, MergingDrops, PinchingJet
 from .continuous import ContinuousScene
 from .drawn import SpecimenKind
-from .fluids import BreakUp, Bubbles, Cuvette, Jet, Shock
+from .fluids import BreakUp, Bubbles, Cuvette, Flotation, Jet, Shock
 from .gas_waves import ExpandingShock
 from .phantoms import Ball, place_capsules, random_foam
 from .red_cells import crowded_cells, random_cells
 from .soft_matter import soft_cells
 from .solids import Channel, Crack, Fibres, Keyhole, Lattice, Star
 
-FieldMatter = Bubbles | Cuvette | Jet | BreakUp | Crack | Shock | Keyhole | Lattice | Fibres | Channel | Star
+FieldMatter = (
+    Bubbles | Flotation | Cuvette | Jet | BreakUp | Crack | Shock | Keyhole | Lattice | Fibres | Channel | Star
+)
 """Every kind that stands still (see `drawn` for what each has)."""
 Changing = MergingDrops | Collapse | PinchingJet | ExpandingShock | CrushedLattice
 """Every kind that changes with time."""
