@@ -105,8 +105,6 @@ MANY, MOST = 6, 3
 """Views from which on two are set aside at a time, and folds at most: six views tell their scatter well enough."""
 EFFORT = 0.2
 """Part of the usual steps of a fit by which hypotheses are compared: all of them have as many."""
-BRIEF = {"retrieval": 20, "corrections": 3, "refine": 1}
-"""Options of `HolographicTV` by which first volumes are made, and what fits that compare hypotheses start from."""
 CHECKED = 4
 """Edge of the squares [pixels], in which unknown light of unseen frames is fitted and tested in turns."""
 
@@ -198,7 +196,9 @@ class FirstVolumes:
     prior: MaterialPrior
     on_progress: Progress
     options: HolographicTV = field(
-        default_factory=lambda: HolographicTV(**BRIEF, iterations=80, upper=0.0, beyond=False, relit=1)
+        default_factory=lambda: HolographicTV(
+            retrieval=20, iterations=80, corrections=3, upper=0.0, refine=1, beyond=False, relit=1
+        )
     )
     taken: tuple[str, ...] = ()
     """What was decided of light and noise."""

@@ -23,14 +23,7 @@ from ..inference import Decision, Score, select
 from ..matter import MatterKind
 from ..representations import Stored, VoxelGrid
 from ..tables import with_entries
-from .cross_validation import (
-    BRIEF,
-    BY_FISSION,
-    EFFORT,
-    FirstVolumes,
-    predictions,
-    without_matter,
-)
+from .cross_validation import BY_FISSION, EFFORT, FirstVolumes, predictions, without_matter
 from .method import Method, Task, first_of_task, solve_stages
 from .trials import WITHOUT, Hypothesis, Trial, Trials, accepted, hypothesis_of, name_of
 from .uncertain import Determined, likeliest_ratio
@@ -123,13 +116,13 @@ class _FlatVolumes:
 class TrialFits:
     """Fits of the methods for either kind of matter to coarse frames, under hypotheses about light and noise.
 
-    They start from volumes as brief as first ones (`BRIEF`). Two levels alone need no ratio δ/β; else it is, where
-    nothing is known, the likeliest one, as in a run; before light is decided, that of the first volume.
+    They start from volumes on voxels of a pixel, as first ones are. Two levels alone need no ratio δ/β; else it is,
+    where nothing is known, the likeliest one, as in a run; before light is decided, that of the first volume.
     """
 
     def __init__(self, task: Task, first: FirstVolumes, methods: Mapping[MatterKind, Method]) -> None:
         self._task, self._first = task, first
-        self._methods = {kind: with_entries(method, BRIEF) for kind, method in methods.items()}
+        self._methods = {kind: with_entries(method, {"refine": 1}) for kind, method in methods.items()}
         self._trials = Trials(first, task.light)
 
     def score(self, name: str, kind: MatterKind, fold: int, two: bool = False) -> Score:
