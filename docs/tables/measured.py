@@ -142,17 +142,19 @@ def cell() -> str:
 
 @table("nothing-told", "python benchmarks/nothing_told.py --data FOLDER", "half an hour", "nothing_told.csv")
 def nothing_told() -> str:
-    """Scenes of which nothing is told, before and after absorption became a hypothesis."""
-    rows = read("nothing_told.csv")
-    old = {(r["family"], r["seed"]): r for r in rows if r["commit"] == "198a344"}
+    """Scenes of which nothing is told: before and after absorption became a hypothesis, and by six ratios."""
+    rows, commits = read("nothing_told.csv"), ("198a344", "d883ade", "1f58925")
+    found = {(r["family"], r["seed"], r["commit"]): r for r in rows}
     lines = list[list[str]]()
-    for row in (r for r in rows if r["commit"] != "198a344"):
-        before = old[row["family"], row["seed"]]
-        ratios = (rounded(r["found"], 0) if r["found"] != "nan" else "two levels" for r in (before, row))
-        values = (rounded(r[name], digits) for name, digits in (("error", 3), ("seconds", 0)) for r in (before, row))
-        lines.append([row["family"], row["seed"], row["use"], rounded(row["true"], 0), *ratios, *values])
-    head = ("family", "seed", "made on", "true δ/β", "before", "now", "error before", "now")
-    return markdown((*head, "processor before / s", "now / s"), sorted(lines, key=lambda one: one[2]))
+    for row in (r for r in rows if r["commit"] == commits[-1]):
+        each = [found.get((row["family"], row["seed"], one)) for one in commits]
+        true = rounded(row["true"], 0) if row["true"] != "nan" else "two"
+        ratios = ("–" if r is None else rounded(r["found"], 0) if r["found"] != "nan" else "two" for r in each)
+        errors = ("–" if r is None else rounded(r["error"], 3) for r in each)
+        lines.append([row["family"], row["seed"], row["use"], true, *ratios, *errors, rounded(row["seconds"], 0)])
+    columns = [f"{what} {one}" for what in ("δ/β", "error") for one in commits]
+    head = ("family", "seed", "made on", "true δ/β", *columns, "processor / s")
+    return markdown(head, sorted(lines, key=lambda one: one[2]))
 
 
 @table("gpu", "python benchmarks/gpu.py --csv docs/data/gpu.csv", "a minute, with a GPU", "gpu.csv")

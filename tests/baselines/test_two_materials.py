@@ -127,18 +127,6 @@ def test_voxels_are_of_the_material_that_they_are_full_of(shares, grid):
     assert float(denser[torch.from_numpy(whole - cores) > 0.99].mean()) > 0.9
 
 
-def test_materials_on_either_side_of_the_medium_are_told_apart_by_themselves(delta):
-    """Between the two sides there is nothing, so that no layer has to be thick enough."""
-    levels = (SILICA.delta, OIL.delta)
-    mirrored = torch.cat([delta, -delta])
-    found = told_apart(mirrored, (*levels, *(-level for level in levels)), 1)
-    alone = told_apart(delta, levels, 1)
-    assert torch.equal(found[:2, : len(delta)], alone)
-    assert torch.equal(found[2:, len(delta) :], alone)
-    assert not found[:2, len(delta) :].any()
-    assert not found[2:, : len(delta)].any()
-
-
 def test_a_layer_thinner_than_two_pixels_is_no_material_of_its_own():
     slab = torch.zeros(9, 11, 13)
     slab[:, 3:8] = 1.0

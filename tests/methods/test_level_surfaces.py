@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import holosplat as hs
+from holosplat.baselines.two_materials import told_apart
 from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
 from holosplat.fit.smooth_volume import ContinuousPrior, KnownLevels
@@ -113,6 +114,15 @@ def cut_on_both_sides() -> SurfaceMesh:
     matter = Matter.several(WALL, BUBBLE, LIQUID)
     found = torch.from_numpy(both_sides().voxelise(GRID).delta / WALL.delta).float()
     return cut_surfaces(found, GRID, PIXEL, matter)
+
+
+def test_materials_on_either_side_are_told_apart_by_themselves():
+    """The volume and its negative beside each other: what is of each, as in the volume alone."""
+    delta, levels = volume().values[0], (1.0, LIQUID.delta / WALL.delta)
+    alone = told_apart(delta, levels, 1)
+    found = told_apart(torch.cat([delta, -delta]), (*levels, *(-level for level in levels)), 1)
+    assert alone[1].any()
+    assert torch.equal(found, torch.cat([torch.cat([alone, 0 * alone]), torch.cat([0 * alone, alone])], dim=1))
 
 
 def test_surfaces_on_either_side_of_the_medium_enclose_what_is_stronger_on_theirs():
