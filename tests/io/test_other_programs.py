@@ -116,7 +116,7 @@ def test_stl_holds_all_bodies_in_micrometres(tmp_path):
 
 
 def test_glb_has_a_node_a_body_in_metres_with_y_up(tmp_path):
-    write_glb(tmp_path / "b.glb", bodies(), MATTER)
+    write_glb(tmp_path / "b.glb", bodies(), [MATTER] * 2)
     scene = trimesh.load_scene(tmp_path / "b.glb")
     assert sorted(scene.graph.nodes_geometry) == ["body000", "body001"]
     for body in bodies():

@@ -25,7 +25,7 @@ def bodies() -> list[TriangleMesh]:
 
 
 def test_bodies_come_back_apart(tmp_path):
-    write_vtu(tmp_path / "b.vtu", bodies(), MATTER)
+    write_vtu(tmp_path / "b.vtu", bodies(), [MATTER] * 2)
     found = read_meshes(tmp_path / "b.vtu", "um")
     assert [body.name for body in found] == ["body000", "body001"]
     for body, true in zip(found, bodies()):
@@ -35,7 +35,7 @@ def test_bodies_come_back_apart(tmp_path):
 
 def test_another_reader_finds_the_data_of_each_body(tmp_path):
     meshio = pytest.importorskip("meshio")
-    write_vtu(tmp_path / "b.vtu", bodies(), MATTER)
+    write_vtu(tmp_path / "b.vtu", bodies(), [MATTER] * 2)
     found, true = meshio.read(tmp_path / "b.vtu"), bodies()
     assert [block.type for block in found.cells] == ["triangle"]
     data = {name: blocks[0] for name, blocks in found.cell_data.items()}
@@ -49,10 +49,19 @@ def test_another_reader_finds_the_data_of_each_body(tmp_path):
         assert data["volume_m3"][data["body"] == number] == pytest.approx(body.volume, rel=1e-12)
 
 
+def test_bodies_of_several_materials_have_their_own(tmp_path):
+    other, (first, second) = Matter((DeltaBeta(-3e-7, -1e-10),)), bodies()
+    write_vtu(tmp_path / "b.vtu", [first, second], [MATTER, other])
+    data = pytest.importorskip("meshio").read(tmp_path / "b.vtu").cell_data
+    counts = [len(first.faces), len(second.faces)]
+    np.testing.assert_array_equal(data["delta"][0], np.repeat([4e-7, -3e-7], counts))
+    np.testing.assert_array_equal(data["beta"][0], np.repeat([2e-10, -1e-10], counts))
+
+
 def test_units_are_said(tmp_path):
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridReader
 
-    write_vtu(tmp_path / "b.vtu", bodies(), MATTER)
+    write_vtu(tmp_path / "b.vtu", bodies(), [MATTER] * 2)
     reader = vtkXMLUnstructuredGridReader()
     reader.SetFileName(str(tmp_path / "b.vtu"))
     reader.Update()
@@ -62,7 +71,7 @@ def test_units_are_said(tmp_path):
 def test_no_bodies_and_cut_off_files_are_refused(tmp_path):
     with pytest.raises(InputError, match="at least one body"):
         write_vtu(tmp_path / "n.vtu", [], MATTER)
-    write_vtu(tmp_path / "b.vtu", bodies(), MATTER)
+    write_vtu(tmp_path / "b.vtu", bodies(), [MATTER] * 2)
     content = (tmp_path / "b.vtu").read_bytes()
     (tmp_path / "b.vtu").write_bytes(content[: len(content) // 2])
     with pytest.raises(InputError, match=r"b\.vtu must be a complete mesh file"):

@@ -146,6 +146,16 @@ def test_line_integrals_on_both_sides_are_those_of_each_step_alone():
         torch.testing.assert_close(mine, sum(parts), rtol=1e-9, atol=1e-18)
 
 
+def test_bodies_know_what_is_inside_them():
+    """The coated ball is a ball of each, of which that of the liquid holds the other; a wall has its cavity."""
+    bodies, fillings = cut_on_both_sides().bodies(), cut_on_both_sides().fillings()
+    assert [one.channels for one in fillings] == [(LIQUID,), (BUBBLE,), (WALL,)]
+    sizes = np.array([body.volume for body in bodies]) / PIXEL**3
+    np.testing.assert_allclose(sizes, 4 / 3 * np.pi * np.array([5.5, 3.6, 3.4]) ** 3, rtol=0.12)
+    volumes = {one.channels[0]: body.volume for one, body in zip(cut().fillings(), cut().bodies())}
+    assert volumes[LIQUID] - volumes[WALL] == pytest.approx(4 / 3 * np.pi * 5.0**3 * PIXEL**3, rel=0.08)
+
+
 def test_absorption_on_both_sides_lies_between_each_material_and_the_medium():
     known = KnownLevels((WALL, BUBBLE), DeltaBeta(WALL.delta, 0.0))
     assert known.occupancies == pytest.approx((-0.75, 1.0))

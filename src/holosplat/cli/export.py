@@ -222,6 +222,7 @@ def _export_splats(result: Reconstruction, out: Path) -> None:
 def _export_bodies(one: Moment, out: Path) -> None:
     from ..io.paraview import write_vtu
     from ..io.solids import write_glb, write_stl
+    from ..representations import SurfaceMesh
     from .track import write_bodies
 
     found = one.result.object
@@ -229,7 +230,8 @@ def _export_bodies(one: Moment, out: Path) -> None:
         raise InputError(
             f"--bodies needs a run of surfaces, but this one holds {found.described}; use holosplat surface."
         )
-    suffix, matter, of = out.suffix.lower(), found.matter, one.result.contents
+    suffix, of = out.suffix.lower(), one.result.contents
+    matter = found.fillings() if isinstance(found, SurfaceMesh) else [found.matter] * len(one.bodies)
     if suffix == STL:
         write_stl(out, one.bodies)
     elif suffix == GLB:
@@ -237,7 +239,7 @@ def _export_bodies(one: Moment, out: Path) -> None:
     elif suffix == VTU:
         write_vtu(out, one.bodies, matter, of)
     else:
-        write_bodies(out, one.bodies, of.of_matter(matter), {})
+        write_bodies(out, one.bodies, [of.of_matter(each) for each in matter], {})
     say(f"wrote {out}: {len(one.bodies)} bodies")
 
 

@@ -302,23 +302,26 @@ def surface(
     said = {"seconds": seconds, "settings": asdict(how), name.lower(): before.as_dict(), "surfaces": after.as_dict()}
     whole = load_reconstruction(folder).object
     bodies = whole.parted(found.vertices.detach().cpu()) if isinstance(whole, MovingSurfaces) else found.bodies()
-    write_bodies(out, bodies, result.contents.of_matter(found.matter), said)
+    constants = result.contents.of_matter(found.matter)  # of one material, for which surfaces are refined
+    write_bodies(out, bodies, [constants] * len(bodies), said)
     for of, scores in ((name, before), ("surfaces", after)):
         print(f"{of}:", *scores.lines(), sep="\n  ")
     say(f"wrote {out}: {len(bodies)} bodies of {len(found.faces)} triangles, {seconds:.1f} s")
 
 
 def write_bodies(
-    out: Path, bodies: Sequence[TriangleMesh], constants: Mapping[str, float], said: Mapping[str, Any]
+    out: Path, bodies: Sequence[TriangleMesh], constants: Sequence[Mapping[str, float]], said: Mapping[str, Any]
 ) -> None:
     """Write one VTK file a body (µm), and summary.json with what is `said` beside their sizes and the `constants` of
-    their matter."""
+    the matter of each."""
+    one = all(each == constants[0] for each in constants)
     with atomic_folder(out) as temporary:
         for body in bodies:
             write_mesh(temporary / f"{body.name}.vtk", body, LENGTH_UNIT)
-        about = {
-            "bodies": {body.name: {"triangles": len(body.faces), "volume_m3": body.volume} for body in bodies},
-            "length_unit": LENGTH_UNIT,
-            "material": dict(constants),
-        }
+        sizes = {body.name: {"triangles": len(body.faces), "volume_m3": body.volume} for body in bodies}
+        about: dict[str, Any] = {"bodies": sizes, "length_unit": LENGTH_UNIT}
+        if one:
+            about["material"] = dict(constants[0])
+        else:
+            about["materials"] = {body.name: dict(each) for body, each in zip(bodies, constants)}
         write_json(temporary / "summary.json", {**about, **said})

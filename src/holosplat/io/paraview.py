@@ -150,8 +150,8 @@ def _names(data: Any) -> str:
     return ", ".join(str(data.GetArrayName(k)) for k in range(data.GetNumberOfArrays())) or "none"
 
 
-def write_vtu(path: Path, bodies: Sequence[TriangleMesh], matter: Matter, of: Contents = REFRACTION) -> None:
-    """Write `bodies`, all of `matter`; `read_meshes` takes them apart again."""
+def write_vtu(path: Path, bodies: Sequence[TriangleMesh], matter: Sequence[Matter], of: Contents = REFRACTION) -> None:
+    """Write `bodies`, each of its `matter`; `read_meshes` takes them apart again."""
     from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
     from vtkmodules.vtkCommonCore import vtkPoints
     from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkUnstructuredGrid
@@ -161,7 +161,8 @@ def write_vtu(path: Path, bodies: Sequence[TriangleMesh], matter: Matter, of: Co
     whole = joined(bodies)
     places, corners = whole.vertices / LENGTH_UNITS[LENGTH_UNIT], whole.faces
     number = np.repeat(np.arange(len(bodies), dtype=np.int32), [len(body.faces) for body in bodies])
-    data = {name: np.full(len(corners), value) for name, value in of.of_matter(matter).items()}
+    constants = [of.of_matter(each) for each in matter]
+    data = {name: np.array([each[name] for each in constants])[number] for name in constants[0]}
     data = {BODY: number, **data, "volume_m3": np.array([body.volume for body in bodies])[number]}
 
     grid, points, cells = vtkUnstructuredGrid(), vtkPoints(), vtkCellArray()

@@ -58,12 +58,13 @@ def write_stl(path: Path, bodies: Sequence[TriangleMesh]) -> None:
         file.write(facets.tobytes())
 
 
-def write_glb(path: Path, bodies: Sequence[TriangleMesh], matter: Matter, of: Contents = REFRACTION) -> None:
-    """Write still bodies as a GLB file, one node a body, with δ and β (or µ and β) of `matter` in its extras."""
+def write_glb(path: Path, bodies: Sequence[TriangleMesh], matter: Sequence[Matter], of: Contents = REFRACTION) -> None:
+    """Write still bodies as a GLB file, one node a body, with δ and β (or µ and β) of the `matter` of each in the
+    extras of its material."""
     require(len(bodies) > 0, "a GLB file needs at least one body.")
-    file = _Glb(of.of_matter(matter))
-    for body in bodies:
-        file.add(body.name, body.vertices, body.faces)
+    file = _Glb()
+    for body, filling in zip(bodies, matter):
+        file.add(body.name, of.of_matter(filling), body.vertices, body.faces)
     file.write(path)
 
 
@@ -73,14 +74,14 @@ def write_moving_glb(path: Path, moving: MovingSurfaces, times: Sequence[float],
     Weights of B-splines add up to one, so that a path Σ w_k c_k is c_0 + Σ w_k (c_k - c_0): the differences are morph
     targets, and the animation gives their weights.
     """
-    file = _Glb(of.of_matter(moving.matter))
+    file, constants = _Glb(), of.of_matter(moving.matter)
     shown = np.linspace(times[0], times[-1], FINE * (len(times) - 1) + 1)
     weights = moving.basis.weights(shown)[:, 1:]
     paths = moving.coefficients.detach().double().numpy() * moving.unit_length
     for number in range(moving.count):
         used, faces = moving.body(number)
         own = paths[:, used.numpy()]
-        file.add(f"body{number:03d}", own[0], faces.numpy(), own[1:] - own[0], weights[0])
+        file.add(f"body{number:03d}", constants, own[0], faces.numpy(), own[1:] - own[0], weights[0])
     if len(times) > 1 and weights.shape[1] > 0:
         file.animate(weights, {"first_s": float(times[0]), "last_s": float(times[-1])})
     file.write(path)
@@ -90,7 +91,7 @@ def write_moving_glb(path: Path, moving: MovingSurfaces, times: Sequence[float],
 class _Glb:
     """A glTF document as it grows, and its bytes."""
 
-    constants: dict[str, float]
+    constants: list[dict[str, float]] = field(default_factory=list)
     blob: bytearray = field(default_factory=bytearray)
     views: list[dict[str, Any]] = field(default_factory=list)
     accessors: list[dict[str, Any]] = field(default_factory=list)
@@ -100,13 +101,17 @@ class _Glb:
     def add(
         self,
         name: str,
+        constants: dict[str, float],
         vertices: np.ndarray,
         faces: np.ndarray,
         targets: np.ndarray | Sequence[np.ndarray] = (),
         weights: np.ndarray | Sequence[float] = (),
     ) -> None:
-        """A body of `vertices` [P, 3] [m], with morph `targets` [K, P, 3] [m] and the `weights` [K] it begins with."""
-        primitive: dict[str, Any] = {"attributes": {"POSITION": self._places(vertices)}, "material": 0}
+        """A body of `vertices` [P, 3] [m] of matter with `constants`, with morph `targets` [K, P, 3] [m] and the
+        `weights` [K] it begins with."""
+        self.constants += [] if constants in self.constants else [constants]
+        material = self.constants.index(constants)
+        primitive: dict[str, Any] = {"attributes": {"POSITION": self._places(vertices)}, "material": material}
         primitive["indices"] = self._stored(faces.reshape(-1).astype("<u4"), "SCALAR", UNSIGNED, INDICES)
         mesh: dict[str, Any] = {"name": name, "primitives": [primitive]}
         if len(targets):
@@ -121,9 +126,7 @@ class _Glb:
         values = self._stored(weights.reshape(-1).astype("<f4"), "SCALAR", FLOAT, None)
         channels = [{"sampler": 0, "target": {"node": 1 + mesh, "path": "weights"}} for mesh in range(len(self.meshes))]
         sampler = {"input": times, "output": values, "interpolation": "LINEAR"}
-        self.animations.append(
-            {"name": "motion", "channels": channels, "samplers": [sampler], "extras": self.constants}
-        )
+        self.animations.append({"name": "motion", "channels": channels, "samplers": [sampler], "extras": extras})
 
     def write(self, path: Path) -> None:
         """The document and its bytes as one file."""
@@ -152,7 +155,9 @@ class _Glb:
             "scenes": [{"nodes": [0]}],
             "nodes": nodes,
             "meshes": self.meshes,
-            "materials": [{"name": "matter", "pbrMetallicRoughness": colour, "extras": self.constants}],
+            "materials": [
+                {"name": "matter", "pbrMetallicRoughness": colour, "extras": each} for each in self.constants
+            ],
             **({"animations": self.animations} if self.animations else {}),
             "accessors": self.accessors,
             "bufferViews": self.views,

@@ -14,7 +14,7 @@ from ..backends import device, in_main_memory
 from ..checks import InputError, positive, require
 from ..display import of_object
 from ..geometry import Grid, Poses, Views
-from ..matter import Matter
+from ..matter import DeltaBeta, Matter
 from ..mesh import TriangleMesh, joined, part_of, shell_labels, winding_number
 from ..projectors.surface import surface_occupancy, surface_thickness
 from ..volume import LineIntegrals, Volume
@@ -160,21 +160,31 @@ class SurfaceMesh:
     def bodies(self) -> list[TriangleMesh]:
         """One mesh [m] for each body, with its cavities, the largest first, named body000, body001 …
 
-        `InputError` if no surface encloses matter.
+        Of several materials a body goes as far as the weakest inside it. `InputError` if no surface encloses matter.
         """
-        whole = self.mesh()
-        labels = shell_labels(whole.faces, len(whole.vertices))
-        shells = [part_of(whole, whole.faces[labels == k], "shell") for k in range(labels.max() + 1)]
-        shells.sort(key=lambda shell: -shell.volume)
-        outer = [shell for shell in shells if shell.volume > 0]
-        if not outer:
+        return [joined(parts, f"body{k:03d}") for k, (_, parts) in enumerate(self._bodies())]
+
+    def fillings(self) -> list[Matter]:
+        """What is just inside each of the `bodies`."""
+        return [Matter.one(*material) for material, _ in self._bodies()]
+
+    def _bodies(self) -> list[tuple[DeltaBeta, list[TriangleMesh]]]:
+        whole, found = self.mesh(), list[tuple[DeltaBeta, list[TriangleMesh]]]()
+        for material, step in zip(self.matter.channels, self.steps):
+            faces = step.cpu().numpy()
+            labels = shell_labels(faces, len(whole.vertices))
+            shells = [part_of(whole, faces[labels == k], "shell") for k in range(labels.max(initial=-1) + 1)]
+            shells.sort(key=lambda shell: -shell.volume)
+            outer = [shell for shell in shells if shell.volume > 0]
+            members: list[list[TriangleMesh]] = [[shell] for shell in outer]
+            for cavity in shells[len(outer) :] if outer else ():
+                around = [round(winding_number(o.vertices[o.faces], cavity.vertices[0]), 3) for o in outer]
+                smallest = max(range(len(outer)), key=lambda k: (around[k], k))  # outer ones are sorted by size
+                members[smallest].append(cavity)
+            found += [(material, parts) for parts in members]
+        if not found:
             raise InputError("the surfaces enclose no matter: all of them bound cavities; check how they are wound.")
-        members: list[list[TriangleMesh]] = [[shell] for shell in outer]
-        for cavity in shells[len(outer) :]:
-            around = [round(winding_number(o.vertices[o.faces], cavity.vertices[0]), 3) for o in outer]
-            smallest = max(range(len(outer)), key=lambda k: (around[k], k))  # outer ones are sorted by size
-            members[smallest].append(cavity)
-        return [joined(parts, f"body{k:03d}") for k, parts in enumerate(members)]
+        return sorted(found, key=lambda one: -one[1][0].volume)
 
 
 class MovingSurfaces:
