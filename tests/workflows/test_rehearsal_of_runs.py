@@ -11,11 +11,15 @@ import torch
 from scipy.optimize import isotonic_regression
 
 import holosplat as hs
+from holosplat.align.geometry import Geometry
+from holosplat.align.poses import PosePrior
+from holosplat.align.views import AlignedViews
 from holosplat.checks import InputError
 from holosplat.geometry import Grid
 from holosplat.inference import Decision
 from holosplat.matter import DeltaBeta, MaterialPrior, Matter
 from holosplat.methods import METHODS
+from holosplat.methods.uncertain import Determined
 from holosplat.metrics import dice
 from holosplat.optics import NoiseModel
 from holosplat.optics.background import LightOptions
@@ -29,15 +33,18 @@ from holosplat.workflows.certainty import (
     NULL,
     Factor,
     MatterMap,
-    centre_and_scale,
     compare_causes,
     conformal_quantile,
     errors_of,
+    fitted_factor,
     matter_probabilities,
     occupancy_counts,
+    scale_of,
+    true_sizes,
 )
 from holosplat.workflows.next_step import STEPS
 from holosplat.workflows.rehearsal import Again, Rehearsal, read_rehearsal, rehearse
+from holosplat.workflows.totals import TotalMatter
 from holosplat.workflows.verdict import Verdict
 
 WATER = hs.materials.parse_material("water").delta_beta(20.0)
@@ -89,9 +96,34 @@ def test_the_conformal_quantile_covers_what_it_says():
     assert np.mean(inside) == pytest.approx(0.9, abs=0.02)
 
 
-def test_scales_are_root_mean_squares_and_that_of_a_resolution_is_one():
-    assert centre_and_scale("total", np.array([0.3, -0.4])) == (0.0, pytest.approx(np.sqrt(0.125)))
-    assert centre_and_scale("resolution", np.array([1.0, 3.0])) == (2.0, 1.0)
+def test_scales_are_root_mean_squares_and_that_of_a_resolution_is_the_mean():
+    assert scale_of("total", np.array([0.3, -0.4])) == pytest.approx(np.sqrt(0.125))
+    assert scale_of("resolution", np.array([1.0, 3.0])) == 2.0
+
+
+def test_the_floor_is_that_of_the_shortest_intervals_and_they_cover_scenes_that_were_not_seen():
+    """Errors of scenes good and bad, of their scale: good ones get intervals as short as their own would be."""
+    rng, inside, short = np.random.default_rng(1), [], []
+    for _ in range(300):
+        scales = np.exp(rng.choice([-4.0, 0.0], 60, p=[0.4, 0.6]) + 0.3 * rng.normal(size=60))
+        errors = scales * rng.normal(size=60)
+        floor, factor = fitted_factor(errors[:-20], scales[:-20])
+        reach = factor * (scales[-20:] + floor)
+        inside.extend(np.abs(errors[-20:]) <= reach)
+        short.append(reach[scales[-20:] < 0.1].mean())
+    assert np.mean(inside) == pytest.approx(0.9, abs=0.02)
+    assert np.mean(short) < 0.15
+    assert fitted_factor(np.array([0.0, 2.0]), np.array([0.0, 1.0])) == (1.0, 1.0)
+
+
+def test_sizes_whose_measurement_is_found_are_those_that_the_errors_allow():
+    assert true_sizes(2.0, -0.5, 0.25) == pytest.approx((1.6, 4.0))
+    assert true_sizes(2.0, -1.5, 1.0) == (1.0, np.inf)
+    assert true_sizes(-0.1, -1.5, 1.0) == (0.0, np.inf)
+    wrong = errors_of(
+        replace(result(ball()), total=TotalMatter("δ", -1e-25, 1e-26, 1e-25, "")), ball().voxelise(ball().grid)
+    )
+    assert wrong["total"] < -1
 
 
 @pytest.fixture(scope="module")
@@ -148,6 +180,56 @@ def test_views_turn_about_what_they_look_at():
     beside = middle + np.array([1.0, 0.0, 0.0]) * PIXEL
     along = turned.rotations @ beside - np.c_[turned.shifts, (turned.rotations @ middle)[:, 2]]
     assert along == pytest.approx(views.rotations @ np.array([0.0, 0.0, -1.0]) * PIXEL, abs=1e-15)
+
+
+def test_what_a_run_found_of_distance_energy_and_poses_is_drawn_from_its_errors(few, monkeypatch):
+    """They are found at 0.03 m and 20 keV, within 20 % and 2 % (95 %, as logarithms), and in their plane within 0.5 px
+    and 2°; frames are reconstructed at what was found, and are those of what may be true."""
+    done, scan, _ = few
+    rng, train = np.random.default_rng(0), scan.train().exposures
+    constants = tuple(
+        Determined(name, value, value / by, value * by, (value / 2, value * 2), True)
+        for name, value, by in (("distance", 0.03, 1.2), ("energy_kev", 20.0, 1.02))
+    )
+    searched = AlignedViews(
+        train, np.zeros((3, 7)), np.tile([0.5, 0.5, 0, 2.0, 0, 0, 0], (3, 1)), *np.zeros((3, 3)), (), ()
+    )
+    geometry = Geometry.of_training(scan, searched, PosePrior())
+    unsure = replace(done, constants=constants, geometry=geometry)
+    drawn = [certainty.as_uncertain(unsure, train, 2, rng) for _ in range(400)]
+    for name, by in (("distance", 1.2), ("energy_kev", 1.02)):
+        logs = np.log([getattr(each, name)[0] / getattr(train, name)[0] for each in drawn])
+        assert logs.std() == pytest.approx(0.5 * np.log(by), rel=0.1)
+    moved = np.array([each.views.shifts - train.views.shifts for each in drawn]) / PIXEL
+    assert moved.std(axis=0) == pytest.approx(np.full((3, 2), 0.25), rel=0.15)
+    turns = [
+        np.rad2deg(np.arccos((np.trace(e.views.rotations[1].T @ train.views.rotations[1]) - 1) / 2)) for e in drawn
+    ]
+    assert np.sqrt(np.square(turns).mean()) == pytest.approx(2.0, rel=0.1)
+    assert certainty.as_uncertain(done, train, 2, rng) is train
+
+    told = []
+    real = certainty.reconstruct
+    monkeypatch.setattr(certainty, "reconstruct", lambda *a, **how: told.append(a[0].exposures) or real(*a, **how))
+    monkeypatch.setattr(rehearsal, "_turned", lambda exposures, degrees: exposures)
+    shown = rehearse(replace(done, constants=constants[:1]), scan, PRIOR, METHODS["ctf-tv"], times=2, causes=False)
+    assert {each.distance[0] for each in told} == {0.03}
+    exact = rehearse(done, scan, PRIOR, METHODS["ctf-tv"], times=2, causes=False)
+    assert shown.values("error").mean() > exact.values("error").mean() + 0.005
+
+
+def test_intervals_hold_what_rehearsals_take_for_true(few):
+    """The stated error of the total, and of an estimated δ/β that of δ."""
+    done, _, shown = few
+    unknown = rehearsal._doubts(replace(done, total=None), MaterialPrior.unknown())
+    assert unknown == dict.fromkeys(("total", "delta", "error"), 0.4)
+    stated = replace(done, total=TotalMatter("δ", -2e-22, 1e-22, 2e-22, ""))
+    assert rehearsal._doubts(stated, PRIOR) == {"total": 0.5}
+    doubted = replace(shown, doubts={"total": 3.0})
+    assert doubted.interval("total")[1] > certainty.factors()["total"].factor * 3.0
+    assert doubted.interval("delta") == shown.interval("delta")
+    assert Rehearsal.from_dict(doubted.as_dict()).interval("total") == doubted.interval("total")
+    assert "m³ or more in size" in "".join(replace(doubted, total=1e-22).intervals())
 
 
 def test_larger_pixels_are_rehearsed_on_measured_frames_of_such_pixels(few, monkeypatch):
@@ -284,6 +366,17 @@ def test_rehearsals_are_kept_and_only_those_that_are_missing_are_made(tmp_path, 
     table = folder.read_summary()["rehearsal"]
     assert table["word"] == more.word
     assert hs.workflows.load_reconstruction(folder).method == done.method
+    rehearsal._keep(folder, replace(more, runs=more.runs[:1]))
+    assert read_rehearsal(folder) is None  # one has no spread
+    rehearsal._keep(folder, more)
+
+    def stopped(*args, **how):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(rehearsal, "_shown_by", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        rehearse(done, scan, PRIOR, method, times=2, bins=2, causes=False, folder=folder)
+    assert read_rehearsal(folder) is None  # its map was of the volume that is no longer there
     folder.write_summary(folder.read_summary() | {"rehearsal": {"binned": 1}})
     with pytest.raises(hs.InputError, match="what rehearse wrote"):
         read_rehearsal(folder)

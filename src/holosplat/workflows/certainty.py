@@ -23,10 +23,11 @@ from ..methods.cross_validation import predicted_frames
 from ..methods.illumination import CORRELATED, STAGE
 from ..metrics import robust_material_delta, volume_scores
 from ..metrics.volumes import require_same_grid
+from ..model.alignment import Alignment
 from ..optics.background import LightOptions
 from ..progress import Progress
 from ..rotations import angles_about_y
-from ..scan import Scan, interleaved_split
+from ..scan import Exposures, Scan, interleaved_split
 from ..tables import overridden, paths, read_table
 from ..volume import Volume
 from .evaluate import of_absorption
@@ -45,8 +46,8 @@ LEVEL = 0.9
 class Factor:
     """How a quantity of rehearsals becomes an interval that holds the truth in `LEVEL` of the calibration's scenes.
 
-    floor: median of the quantity's scale over the scenes, added to that of a run: a scale near 0 promises too much
-    (Papadopoulos et al. 2008, normalised nonconformity); factor: of the sum of both
+    floor: added to the scale of a run, for one near 0 promises too much (Papadopoulos et al. 2008, normalised
+    nonconformity); factor: of the sum of both
     """
 
     floor: float
@@ -67,30 +68,49 @@ def conformal_quantile(scores: np.ndarray, level: float) -> float:
     return float(np.sort(scores)[rank - 1]) if rank <= len(scores) else math.inf
 
 
-SIGNED, SIZES = ("total", "delta", "volume"), ("centre", "dice", "error")
-"""Quantities with errors of either sign, as shares; and sizes of errors: of the centre of mass [pixels], 1 - Dice, and
-the relative error of δ. Beside them stands `resolution`, the logarithm of a length over two pixels."""
+def fitted_factor(errors: np.ndarray, scales: np.ndarray) -> tuple[float, float]:
+    """The floor and the factor of a quantity by its errors [N] and its scales [N] in N scenes.
 
-
-def centre_and_scale(name: str, values: np.ndarray) -> tuple[float, float]:
-    """Where a quantity's error is expected by its values in rehearsals [K], and how far off that may be.
-
-    Resolutions at the limit of the sampling have no spread, so that all runs have the same scale.
+    Each floor, of the scales that there are, makes intervals that cover `LEVEL` of the scenes: that of the least mean
+    logarithm of the length is taken (efficiency; Vovk et al. 2016, COPA). Of so few scenes that there is no quantile,
+    the factor is the largest score; then the level is n/(n + 1).
     """
-    if name == "resolution":
-        return float(values.mean()), 1.0
-    return 0.0, float(np.sqrt(np.square(values).mean()))
+    sizes, found = np.abs(errors), list[tuple[float, float, float]]()
+    for floor in np.unique(scales[scales > 0]):
+        scores = sizes / (scales + floor)
+        factor = min(conformal_quantile(scores, LEVEL), float(scores.max()))
+        found.append((float(np.log(factor * (scales + floor)).mean()), float(floor), factor))
+    return min(found)[1:]
+
+
+SIGNED, SIZES = ("total", "delta", "volume"), ("centre", "dice", "error", "resolution")
+"""Quantities with errors of either sign, as shares; and sizes of errors: of the centre of mass [pixels], 1 - Dice, the
+relative error of δ, and the logarithm of the resolution over two pixels."""
+
+
+def scale_of(name: str, values: np.ndarray) -> float:
+    """How far off a quantity may be by its values in rehearsals [K]: their root mean square; of the resolution, whose
+    logarithm is 0 or large, the mean."""
+    return float(values.mean() if name == "resolution" else np.sqrt(np.square(values).mean()))
+
+
+def true_sizes(found: float, low: float, high: float) -> tuple[float, float]:
+    """The least and the largest positive value whose measurement `found` has an error, as a share, of `low` to `high`;
+    a measurement of the wrong sign says nothing of the size."""
+    if found <= 0:
+        return 0.0, math.inf
+    return found / (1 + high), found / (1 + low) if low > -1 else math.inf
 
 
 def errors_of(found: Reconstruction, truth: Volume) -> dict[str, float]:
-    """The quantities `SIGNED`, `SIZES` and `resolution` of a reconstruction against the true volume on its grid."""
+    """The quantities `SIGNED` and `SIZES` of a reconstruction against the true volume on its grid."""
     volume = found.object.voxelise(truth.grid)
     volume, truth = (volume, truth) if found.delta_told else (of_absorption(volume), of_absorption(truth))
     scores, cell = volume_scores(volume, truth), math.prod(truth.grid.voxel_size)
     stated = None if found.total is None else found.total.value
     true = float(truth.delta.sum(dtype=np.float64)) * cell
     size = float(np.abs(truth.delta).sum(dtype=np.float64)) * cell
-    stated = float(volume.delta.sum(dtype=np.float64)) * cell if stated is None else math.copysign(stated, true)
+    stated = float(volume.delta.sum(dtype=np.float64)) * cell if stated is None else stated
     widest, resolution = max(truth.grid.shape) / 2, scores.resolution_half_bit
     periods = 1.0 if resolution is None else min(resolution / (2 * scores.pitch), widest)
     matter, true_matter = (each.delta / scores.material_delta > 0.5 for each in (volume, truth))
@@ -130,6 +150,25 @@ class Again:
         light = light if done.still is None else LightOptions()  # which finds the fixed pattern, too
         how = {"prior": self.prior, "method": self.method, "light": light, "matter": done.choice.matter}
         return reconstruct(scan, seed=self.seed + further, **(how | changed))
+
+
+def as_uncertain(done: Reconstruction, exposures: Exposures, bins: int, rng: np.random.Generator) -> Exposures:
+    """`exposures` [V] of the training frames, on pixels joined `bins` × `bins`, where they may as well be: distance and
+    energy are drawn from the intervals of a run's `constants` (95 %, as logarithms), poses from the standard errors of
+    its `geometry`. Without either they are as given."""
+    for each in done.constants:
+        if each.name in ("distance", "energy_kev"):
+            factor = math.exp(0.25 * math.log(each.high / each.low) * rng.normal())
+            known = getattr(exposures, each.name)
+            reference = None if each.name == "energy_kev" else exposures.reference_kev
+            changed = {each.name: np.clip(known * factor, *each.given), "reference_kev": reference}
+            exposures = replace(exposures, **changed)
+    if done.geometry is None:
+        return exposures
+    errors = np.nan_to_num(done.geometry.errors[~done.geometry.held_out])
+    away = torch.from_numpy(errors * rng.normal(size=errors.shape))
+    shifts, turns, larger = away[:, :2] / bins, torch.deg2rad(away[:, 2:5]), away[:, 6]
+    return Alignment(turns, shifts, away[:, 5], magnified=larger if larger.any() else None).exposures(exposures)
 
 
 NULL = "metadata as given"

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -36,12 +36,14 @@ from .certainty import (
     VOXELS,
     Again,
     MatterMap,
-    centre_and_scale,
+    as_uncertain,
     compare_causes,
     errors_of,
     factors,
     matter_probabilities,
     occupancy_counts,
+    scale_of,
+    true_sizes,
 )
 from .evaluate import of_absorption
 from .next_step import next_step
@@ -49,6 +51,7 @@ from .reconstruct import reconstruct
 from .reconstruction import Reconstruction
 from .run_folder import RunFolder
 from .run_illumination import light_of
+from .totals import ratio_doubt
 from .verdict import Verdict
 
 SIDE = 48
@@ -79,6 +82,7 @@ class Rehearsal:
     pixels, with β in place of an unknown δ; None if it was not kept
     total: that the run states [m³], None for none; quantity: of which index
     cause: between the metadata as given, the null, and mistakes in them; None where the residual gave no reason
+    doubts: standard errors, as shares, of what rehearsals do not show (`_doubts`), by quantity
     """
 
     binned: int
@@ -90,16 +94,17 @@ class Rehearsal:
     total: float | None = None
     quantity: str = "δ"
     cause: Decision | None = None
+    doubts: Mapping[str, float] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, ready for JSON, with what they say; `from_dict` reads them."""
         plain = {"binned": self.binned, "pixel_m": self.pixel, "unit": self.unit}
         plain |= {"explained": self.explained.as_dict()}
         plain |= {"runs": list(self.runs), "total_m3": self.total, "quantity": self.quantity}
-        plain |= {"cause": self.cause and self.cause.as_dict()}
+        plain |= {"cause": self.cause and self.cause.as_dict(), "doubts": dict(self.doubts)}
         if len(self.runs) < FEWEST:
             return plain
-        said = {name: list(self.interval(name)) for name in (*SIGNED, *SIZES, "resolution")}
+        said = {name: list(self.interval(name)) for name in (*SIGNED, *SIZES)}
         return plain | {"word": self.word, "intervals_of_errors": said, "words": self.lines()}
 
     @classmethod
@@ -117,6 +122,7 @@ class Rehearsal:
                 None if total is None else float(total),
                 str(values["quantity"]),
                 None if cause is None else Decision.from_dict(cause),
+                {name: float(value) for name, value in values.get("doubts", {}).items()},
             )
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise InputError(f"a rehearsal must be what rehearse wrote, but it lacks or garbles {error}.") from error
@@ -127,10 +133,9 @@ class Rehearsal:
 
     def interval(self, name: str) -> tuple[float, float]:
         """Ends of the interval of a quantity's error; that of a size begins at 0."""
-        centre, scale = centre_and_scale(name, self.values(name))
-        of = factors()[name]
-        reach = of.factor * (scale + of.floor)
-        return (0.0 if name in SIZES else centre - reach), centre + reach
+        of, scale = factors()[name], scale_of(name, self.values(name))
+        reach = of.factor * (max(scale, self.doubts.get(name, 0.0)) + of.floor)
+        return 0.0 if name in SIZES else -reach, reach
 
     @property
     def matter(self) -> MatterMap:
@@ -200,21 +205,26 @@ class Rehearsal:
 
     def intervals(self) -> list[str]:
         """What the intervals are of, and a line for each quantity."""
-        ends = {name: self.interval(name) for name in (*SIGNED, *SIZES, "resolution")}
+        ends = {name: self.interval(name) for name in (*SIGNED, *SIZES)}
         scenes = min(each.scenes for each in factors().values())
         level = min(LEVEL, scenes / (scenes + 1))  # the largest of few scores stands for their quantile
-        lines = [f"intervals of {level:.0%}, by {len(self.runs)} rehearsals and {scenes} simulated scenes:"]
+        lines = [
+            f"intervals of {level:.0%}, by {len(self.runs)} rehearsals and {scenes} simulated scenes, on pixels of "
+        ]
+        lines[0] += f"{1e6 * self.pixel:.3g} µm:"
         if self.total is not None:
-            low, high = (self.total / (1 + end) if end > -1 else math.inf for end in reversed(ends["total"]))
-            said = f"{low:.3g} to {high:.3g} m³ {self._told('total')}"
-            lines.append(f"total {self.quantity} {self.total:.3g} m³: {said}")
+            sign = math.copysign(1.0, self.unit)
+            low, high = (sign * end for end in true_sizes(sign * self.total, *ends["total"]))
+            said = f"{low:.3g} m³ or more in size" if math.isinf(high) else f"{low:.3g} to {high:.3g} m³"
+            lines.append(f"total {self.quantity} {self.total:.3g} m³: {said} {self._told('total')}")
         named = [("total", f"total {self.quantity}")] if self.total is None else []
         named += [("delta", f"mean {self.quantity} in the matter"), ("volume", "volume of the matter")]
         for name, said in named:
             low, high = (in_percent(end) for end in (min(1.0, -ends[name][0]), ends[name][1]))
             lines.append(f"{said}: up to {low} too low or {high} too high {self._told(name)}")
         expected = "" if self.found is None else f"; expected by the map of matter: {self.matter.expected_dice:.2f}"
-        lengths = [2e6 * self.pixel * max(1.0, math.exp(end)) for end in ends["resolution"]]
+        widest = math.inf if self.found is None else max(self.found.grid.shape) / 2
+        finest, coarsest = (2e6 * self.pixel * size for size in (1, min(math.exp(ends["resolution"][1]), widest)))
         return [
             *lines,
             f"Dice: at least {max(0.0, 1 - ends['dice'][1]):.2f} (rehearsals: {1 - self.values('dice').mean():.2f}"
@@ -222,7 +232,7 @@ class Rehearsal:
             f"relative error of {self.quantity}: at most {ends['error'][1]:.2f} (rehearsals: "
             f"{self.values('error').mean():.2f})",
             f"centre of mass: within {1e6 * ends['centre'][1] * self.pixel:.2g} µm",
-            f"resolution: {lengths[0]:.3g} to {lengths[1]:.3g} µm (full period, half-bit)",
+            f"resolution: at worst {coarsest:.3g} µm (full period, half-bit; these pixels allow {finest:.3g} µm)",
         ]
 
     def _told(self, name: str) -> str:
@@ -261,8 +271,9 @@ def rehearse(
     Frames have noise of the measured ones' power, and their light. They are simulated on a raster of their own, several
     times finer than that of fits, in plain torch; line integrals are those of the result's own representation. All
     views are turned by one random angle about the result, which is as smooth as its own views leave it.
-    Rehearsals take decisions on matter and light, poses and distances for exact. Errors: `InputError` for results in
-    motion, without matter or verdict, and for fewer than 2 rehearsals.
+    What the run found of distance, energy and poses is drawn from its errors; what the scan gave of them, and decisions
+    on matter and light, are taken for exact. Errors: `InputError` for results in motion, without matter or verdict, and
+    for fewer than 2 rehearsals.
 
     Examples:
 
@@ -291,7 +302,7 @@ def rehearse(
     grid = Grid.of_views(coarse.views)
     truth = done.object.voxelise(grid)
     require(bool(truth.delta.any()), "a run must have found matter to be rehearsed, but its volume is empty.")
-    kept = None if folder is None else read_rehearsal(folder)
+    kept = None if folder is None else _kept(folder)
     if kept is None or kept.binned != bins or kept.found is None:
         on_progress("measured frames on larger pixels", 0.0)
         judged = done if bins == 1 else again(coarse)
@@ -299,16 +310,19 @@ def rehearse(
         stated, quantity = (None, "δ") if done.total is None else (done.total.value, done.total.quantity)
         told = _told(done, judged.object.voxelise(grid))
         unit = robust_material_delta(_told(done, truth))
-        kept = Rehearsal(bins, coarse.views.finest, judged.verdict, (), unit, told, stated, quantity)
-        if folder is not None:
+        doubts = _doubts(done, prior)
+        kept = Rehearsal(bins, coarse.views.finest, judged.verdict, (), unit, told, stated, quantity, doubts=doubts)
+        if folder is not None:  # what was there is of another volume
+            folder.write_summary({name: said for name, said in folder.read_summary().items() if name != ENTRY})
             write_volume(folder.path / FOUND, told)
     train = coarse.train()
     noise, factor = _noise_and_light(done, train)
     while len(kept.runs) < times:
         number = len(kept.runs)
         on_progress(f"rehearsal {number + 1} of {times}", number / times)
-        turned = _turned(train.exposures, np.random.default_rng([seed, number]).uniform(0, 360))
-        quiet = _quiet(done, turned)
+        rng = np.random.default_rng([seed, number])
+        turned = _turned(train.exposures, rng.uniform(0, 360))
+        quiet = _quiet(done, as_uncertain(done, turned, bins, rng))
         drawn = quiet * factor + noise.drawn(seed + number).numpy() * np.sqrt(np.clip(quiet, 0, None))
         found = again(replace(train, exposures=turned, frames=drawn.astype(np.float32)), number + 1)
         kept = replace(kept, runs=(*kept.runs, _shown_by(found, truth)))
@@ -383,8 +397,21 @@ def _noise_and_light(done: Reconstruction, train: Scan) -> tuple[NoiseModel, np.
     return lit.noise, lit.factor().numpy()
 
 
+def _doubts(done: Reconstruction, prior: MaterialPrior) -> dict[str, float]:
+    """What the scale of a quantity is at least: of the total the standard error that the run states, as a share; where
+    δ/β was estimated, that of δ/β, which rehearsals of one result take for true."""
+    ratio, total = ratio_doubt(prior, done.constants) if done.delta_told else 0.0, done.total
+    found = dict.fromkeys(("total", "delta", "error"), ratio) if ratio else {}
+    return found | ({"total": total.error / abs(total.value)} if total and total.value and total.error else {})
+
+
 def read_rehearsal(folder: RunFolder) -> Rehearsal | None:
-    """The rehearsals in the summary.json of a run; None where none was made."""
+    """The rehearsals in the summary.json of a run; None where fewer than two were made, which have no spread."""
+    kept = _kept(folder)
+    return None if kept is None or len(kept.runs) < FEWEST else kept
+
+
+def _kept(folder: RunFolder) -> Rehearsal | None:
     if not folder.summary.is_file():
         return None
     with as_written(folder.summary, "what rehearse wrote"):
@@ -398,7 +425,7 @@ def read_rehearsal(folder: RunFolder) -> Rehearsal | None:
 def matter_of(folder: RunFolder) -> MatterMap | None:
     """Where rehearsals of a run say that matter is likely; None where none are kept."""
     kept = read_rehearsal(folder)
-    return None if kept is None or kept.found is None or not kept.runs else kept.matter
+    return None if kept is None or kept.found is None else kept.matter
 
 
 def _keep(folder: RunFolder | None, kept: Rehearsal) -> None:
