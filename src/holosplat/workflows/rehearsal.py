@@ -20,6 +20,7 @@ from ..inference import Decision
 from ..io.volumes import read_volume, write_volume
 from ..matter import MaterialPrior
 from ..methods import Auto, Method
+from ..methods.continued import Continued
 from ..metrics import robust_material_delta
 from ..optics.noise import NoiseModel
 from ..progress import Progress
@@ -138,6 +139,18 @@ class Rehearsal:
         return 0.0 if name in SIZES else -reach, reach
 
     @property
+    def total_ends(self) -> tuple[float, float]:
+        """Ends of the interval of the total [m³], the smaller size first; nan where the run states none."""
+        sign = math.copysign(1.0, self.unit)
+        low, high = true_sizes(sign * (math.nan if self.total is None else self.total), *self.interval("total"))
+        return sign * low, sign * high
+
+    @property
+    def least_dice(self) -> float:
+        """The lower bound of Dice."""
+        return max(0.0, 1 - self.interval("dice")[1])
+
+    @property
     def matter(self) -> MatterMap:
         """Where matter is likely; `InputError` where what was found is not kept."""
         if self.found is None:
@@ -213,8 +226,7 @@ class Rehearsal:
         ]
         lines[0] += f"{1e6 * self.pixel:.3g} µm:"
         if self.total is not None:
-            sign = math.copysign(1.0, self.unit)
-            low, high = (sign * end for end in true_sizes(sign * self.total, *ends["total"]))
+            low, high = self.total_ends
             said = f"{low:.3g} m³ or more in size" if math.isinf(high) else f"{low:.3g} to {high:.3g} m³"
             lines.append(f"total {self.quantity} {self.total:.3g} m³: {said} {self._told('total')}")
         named = [("total", f"total {self.quantity}")] if self.total is None else []
@@ -227,8 +239,7 @@ class Rehearsal:
         finest, coarsest = (2e6 * self.pixel * size for size in (1, min(math.exp(ends["resolution"][1]), widest)))
         return [
             *lines,
-            f"Dice: at least {max(0.0, 1 - ends['dice'][1]):.2f} (rehearsals: {1 - self.values('dice').mean():.2f}"
-            f"{expected})",
+            f"Dice: at least {self.least_dice:.2f} (rehearsals: {1 - self.values('dice').mean():.2f}{expected})",
             f"relative error of {self.quantity}: at most {ends['error'][1]:.2f} (rehearsals: "
             f"{self.values('error').mean():.2f})",
             f"centre of mass: within {1e6 * ends['centre'][1] * self.pixel:.2g} µm",
@@ -294,6 +305,7 @@ def rehearse(
         not isinstance(done.object, InMotion) and done.verdict is not None,
         "rehearse takes a run of reconstruct, of matter at one time; this one moves or has no verdict.",
     )
+    method = method.afresh(done.object) if isinstance(method, Continued) else method  # its start knows the truth
     method = method.suited(done.choice.matter) if isinstance(method, Auto) else method
     bins = max(1, min(scan.views.shape) // SIDE) if bins is None else bins
     require(bins >= 1, f"bins must be 1 pixel or more, but it is {bins}.")
