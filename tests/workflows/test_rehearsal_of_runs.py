@@ -342,9 +342,9 @@ def test_the_three_words(monkeypatch):
     assert made(3.0, 0.5, 1.0, False).excess == (pytest.approx(3.0), 0)
     assert made(3.0, 2.5, 1.0, False, Decision("", "angles", "")).word == "wrong"
     assert made(3.0, 2.5, 1.0, False, Decision("", NULL, "")).word == "limited"
-    assert not made(3.0, 2.5, 1.0, False).doubtful
-    alone = made(3.0, 2.5, 1.0, False)
-    assert replace(alone, runs=tuple({**run, "cause": ""} for run in alone.runs)).doubtful
+    assert made(3.0, 2.5, 1.0, False).doubtful  # rehearsals of wrong metadata leave as much, and have its cause
+    assert made(3.0, 0.5, 1.0, True).doubtful
+    assert not made(1.0, 0.5, 1.0, True).doubtful
 
 
 def test_rehearsals_are_kept_and_only_those_that_are_missing_are_made(tmp_path, monkeypatch):

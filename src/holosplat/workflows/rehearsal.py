@@ -174,10 +174,9 @@ class Rehearsal:
 
     @property
     def doubtful(self) -> bool:
-        """Whether the residual is more than this method leaves, or has a cause that no rehearsal shows."""
-        found = self.explained
-        own = not found.good and found.cause not in [str(run["cause"]) for run in self.runs]
-        return self.excess[0] > self.limit or own
+        """Whether the frames are not explained, or leave more than this method does: rehearsals of wrong metadata have
+        them, too, and may leave as much."""
+        return self.excess[0] > self.limit or not self.explained.good
 
     @property
     def word(self) -> Word:
@@ -275,8 +274,7 @@ def rehearse(
     done: a run of one time; scan: its frames, as `done.placed` gives them; prior, method, seed: of the run
     bins: pixels joined along an edge (default: to about `SIDE` pixels); of joined pixels the measured frames are
     reconstructed, too
-    causes: whether mistakes in the scan are compared on held-out frames (`certainty`) if the residual is more than the
-    rehearsals leave
+    causes: whether mistakes in the scan are compared on held-out frames (`certainty`) if the frames are not explained
     folder: of the run, whose summary.json keeps each rehearsal, so that a later call makes those that are missing
 
     Frames have noise of the measured ones' power, and their light. They are simulated on a raster of their own, several
