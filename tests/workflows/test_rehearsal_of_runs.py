@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import reduce
 
 import numpy as np
 import pytest
@@ -14,36 +13,27 @@ import holosplat as hs
 from holosplat.align.geometry import Geometry
 from holosplat.align.poses import PosePrior
 from holosplat.align.views import AlignedViews
-from holosplat.checks import InputError
 from holosplat.geometry import Grid
 from holosplat.inference import Decision
-from holosplat.matter import DeltaBeta, MaterialPrior, Matter
+from holosplat.matter import MaterialPrior, Matter
 from holosplat.methods import METHODS
 from holosplat.methods.uncertain import Determined
 from holosplat.metrics import dice
 from holosplat.optics import NoiseModel
-from holosplat.optics.background import LightOptions
 from holosplat.representations import VoxelGrid
-from holosplat.tables import paths
 from holosplat.volume import Volume
 from holosplat.workflows import Reconstruction, RunFolder, certainty, rehearsal
 from holosplat.workflows.certainty import (
-    BINS,
-    MISTAKES,
     NULL,
     Factor,
-    MatterMap,
-    compare_causes,
     conformal_quantile,
     errors_of,
     fitted_factor,
-    matter_probabilities,
-    occupancy_counts,
     scale_of,
     true_sizes,
 )
-from holosplat.workflows.next_step import STEPS
-from holosplat.workflows.rehearsal import Again, Rehearsal, read_rehearsal, rehearse
+from holosplat.workflows.matter_map import BINS, MatterMap, matter_probabilities, occupancy_counts
+from holosplat.workflows.rehearsal import Rehearsal, read_rehearsal, rehearse
 from holosplat.workflows.totals import TotalMatter
 from holosplat.workflows.verdict import Verdict
 
@@ -174,7 +164,7 @@ def test_views_turn_about_what_they_look_at():
     views = hs.Views.from_angles([0.0, 50.0], (5, 7), PIXEL)
     middle = np.array([4.0, -2.0, 3.0]) * PIXEL
     views = replace(views, shifts=(views.rotations @ middle)[:, :2])
-    turned = rehearsal._turned(hs.Exposures.of(views, 20.0, 0.03), 90.0).views
+    turned = rehearsal.turned_by(hs.Exposures.of(views, 20.0, 0.03), 90.0).views
     assert Grid.of_views(turned).centre == pytest.approx(middle)
     assert (turned.rotations @ middle)[:, :2] == pytest.approx(turned.shifts)
     beside = middle + np.array([1.0, 0.0, 0.0]) * PIXEL
@@ -211,7 +201,7 @@ def test_what_a_run_found_of_distance_energy_and_poses_is_drawn_from_its_errors(
     told = []
     real = certainty.reconstruct
     monkeypatch.setattr(certainty, "reconstruct", lambda *a, **how: told.append(a[0].exposures) or real(*a, **how))
-    monkeypatch.setattr(rehearsal, "_turned", lambda exposures, degrees: exposures)
+    monkeypatch.setattr(rehearsal, "turned_by", lambda exposures, degrees: exposures)
     shown = rehearse(replace(done, constants=constants[:1]), scan, PRIOR, METHODS["ctf-tv"], times=2, causes=False)
     assert {each.distance[0] for each in told} == {0.03}
     exact = rehearse(done, scan, PRIOR, METHODS["ctf-tv"], times=2, causes=False)
@@ -221,10 +211,10 @@ def test_what_a_run_found_of_distance_energy_and_poses_is_drawn_from_its_errors(
 def test_intervals_hold_what_rehearsals_take_for_true(few):
     """The stated error of the total, and of an estimated δ/β that of δ."""
     done, _, shown = few
-    unknown = rehearsal._doubts(replace(done, total=None), MaterialPrior.unknown())
+    unknown = certainty.doubts_of(replace(done, total=None), MaterialPrior.unknown())
     assert unknown == dict.fromkeys(("total", "delta", "error"), 0.4)
     stated = replace(done, total=TotalMatter("δ", -2e-22, 1e-22, 2e-22, ""))
-    assert rehearsal._doubts(stated, PRIOR) == {"total": 0.5}
+    assert certainty.doubts_of(stated, PRIOR) == {"total": 0.5}
     doubted = replace(shown, doubts={"total": 3.0})
     assert doubted.interval("total")[1] > certainty.factors()["total"].factor * 3.0
     assert doubted.interval("delta") == shown.interval("delta")
@@ -253,7 +243,7 @@ def test_turned_views_show_what_one_view_leaves_free(monkeypatch):
     done = hs.reconstruct(scan, PRIOR, method)
     true = errors_of(done, cells().voxelise(Grid.of_views(scan.views)))["error"]
     turned = rehearse(done, scan, PRIOR, method, times=2, causes=False).values("error")
-    monkeypatch.setattr(rehearsal, "_turned", lambda exposures, degrees: exposures)
+    monkeypatch.setattr(rehearsal, "turned_by", lambda exposures, degrees: exposures)
     still = rehearse(done, scan, PRIOR, method, times=2, causes=False).values("error")
     assert still.max() < 0.75 * true
     assert np.abs(turned - true).max() < 0.2 * true
@@ -394,61 +384,3 @@ def test_bad_input_is_refused(few):
     empty = done.object.with_parameters({"values": torch.zeros_like(done.object.values)})
     with pytest.raises(hs.InputError, match="its volume is empty"):
         rehearse(replace(done, object=empty), scan, PRIOR, METHODS["ctf-tv"])
-
-
-def test_every_mistake_has_a_command():
-    assert {key for key, _ in MISTAKES.values()} <= STEPS.keys()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["auto", "volume", "voxels", "surfaces"])
-def test_matter_beyond_the_field_is_tried_in_every_volume_of_a_method(name, few):
-    scan, method = few[1], METHODS[name]
-    _, how = MISTAKES["matter beyond the field"][1](scan, Again(PRIOR, method, 0, few[0]))
-    changed = paths_and_values(how["method"])
-    beside = {path for path in changed if path.endswith("volume.beside")}
-    assert len(beside) == (2 if name == "auto" else 1)
-    assert {path for path, value in paths_and_values(method).items() if changed[path] != value} == beside
-    assert {changed[path] for path in beside} == {0.5}
-    with pytest.raises(InputError, match="the method per-view has no matter beyond the field"):
-        MISTAKES["matter beyond the field"][1](scan, Again(PRIOR, METHODS["tikhonov-tv"], 0, few[0]))
-
-
-def paths_and_values(method):
-    return {path: reduce(getattr, path.split("."), method) for path in paths(method) if not path.endswith("kind")}
-
-
-def test_mistakes_are_found_on_held_out_frames_and_none_where_there_is_none(monkeypatch):
-    scan, method = scan_of(12), METHODS["paganin-tv"]
-    few = ("other sign of δ", "twice the angles", "matter beyond the field")
-    monkeypatch.setattr(certainty, "MISTAKES", {name: MISTAKES[name] for name in few})
-    again = Again(PRIOR, method, 0, hs.reconstruct(scan, PRIOR, method))
-    halved, _ = MISTAKES["half the angles"][1](scan, again)
-    found = compare_causes(halved, again)
-    assert found.choice == "angles"
-    assert [each.name for each in found.compared] == ["other sign of δ", "twice the angles"]
-    assert compare_causes(scan, again).choice == NULL
-    other = MaterialPrior.known(DeltaBeta(-WATER.delta, -WATER.beta))
-    assert compare_causes(scan, replace(again, prior=other)).choice == "sign"
-    assert compare_causes(scan[np.arange(3)], again).choice == NULL
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("wrong", ["", "half the angles"])
-def test_the_verdict_separates_right_and_wrong_scans(wrong, few, monkeypatch):
-    """By the shipped factors; the cause is compared by one mistake, beside the right one."""
-    tried = ("other sign of δ", "twice the angles")
-    scan, method = scan_of(12, 50000.0), METHODS["holographic-tv"]
-    if wrong:
-        scan, _ = MISTAKES[wrong][1](scan, Again(PRIOR, method, 0, few[0]))
-    monkeypatch.setattr(certainty, "MISTAKES", {name: MISTAKES[name] for name in tried})
-    shown = rehearse(hs.reconstruct(scan, PRIOR, method), scan, PRIOR, method, times=2)
-    assert (shown.word == "wrong") == bool(wrong)
-    if wrong:
-        assert shown.cause is not None
-        assert shown.cause.choice == "angles"
-
-
-def test_smooth_light_without_air_is_refused():
-    with pytest.raises(hs.InputError, match="shows no air"):
-        hs.reconstruct(scan_of(12), PRIOR, METHODS["paganin-tv"], light=LightOptions("smooth"))

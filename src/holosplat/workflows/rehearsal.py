@@ -11,18 +11,16 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
-import torch
 
-from ..beamline.simulate import Simulation, simulate, simulated_frames
+from ..beamline.simulate import simulate
 from ..checks import InputError, as_written, require
-from ..geometry import Grid, rotation_y
+from ..geometry import Grid
 from ..inference import Decision
 from ..io.volumes import read_volume, write_volume
 from ..matter import MaterialPrior
 from ..methods import Auto, Method
 from ..methods.continued import Continued
 from ..metrics import robust_material_delta
-from ..optics.noise import NoiseModel
 from ..progress import Progress
 from ..representations import InMotion
 from ..scan import Exposures, Scan
@@ -30,29 +28,26 @@ from ..units import in_percent, two_digits
 from ..volume import Object, Volume
 from .certainty import (
     LEVEL,
-    MATTER,
     NULL,
     SIGNED,
     SIZES,
-    VOXELS,
     Again,
-    MatterMap,
     as_uncertain,
     compare_causes,
+    doubts_of,
+    drawn_frames,
     errors_of,
     factors,
-    matter_probabilities,
-    occupancy_counts,
     scale_of,
     true_sizes,
+    turned_by,
 )
 from .evaluate import of_absorption
+from .matter_map import MATTER, VOXELS, MatterMap, matter_probabilities, occupancy_counts
 from .next_step import next_step
 from .reconstruct import reconstruct
 from .reconstruction import Reconstruction
 from .run_folder import RunFolder
-from .run_illumination import light_of
-from .totals import ratio_doubt
 from .verdict import Verdict
 
 SIDE = 48
@@ -83,7 +78,7 @@ class Rehearsal:
     pixels, with β in place of an unknown δ; None if it was not kept
     total: that the run states [m³], None for none; quantity: of which index
     cause: between the metadata as given, the null, and mistakes in them; None where the residual gave no reason
-    doubts: standard errors, as shares, of what rehearsals do not show (`_doubts`), by quantity
+    doubts: standard errors, as shares, of what rehearsals do not show (`doubts_of`), by quantity
     """
 
     binned: int
@@ -320,25 +315,24 @@ def rehearse(
         stated, quantity = (None, "δ") if done.total is None else (done.total.value, done.total.quantity)
         told = _told(done, judged.object.voxelise(grid))
         unit = robust_material_delta(_told(done, truth))
-        doubts = _doubts(done, prior)
+        doubts = doubts_of(done, prior)
         kept = Rehearsal(bins, coarse.views.finest, judged.verdict, (), unit, told, stated, quantity, doubts=doubts)
         if folder is not None:  # what was there is of another volume
             folder.write_summary({name: said for name, said in folder.read_summary().items() if name != ENTRY})
             write_volume(folder.path / FOUND, told)
     train = coarse.train()
-    noise, factor = _noise_and_light(done, train)
     while len(kept.runs) < times:
         number = len(kept.runs)
         on_progress(f"rehearsal {number + 1} of {times}", number / times)
         rng = np.random.default_rng([seed, number])
-        turned = _turned(train.exposures, rng.uniform(0, 360))
-        quiet = _quiet(done, as_uncertain(done, turned, bins, rng))
-        drawn = quiet * factor + noise.drawn(seed + number).numpy() * np.sqrt(np.clip(quiet, 0, None))
-        found = again(replace(train, exposures=turned, frames=drawn.astype(np.float32)), number + 1)
+        turned = turned_by(train.exposures, rng.uniform(0, 360))
+        drawn = drawn_frames(done, train, as_uncertain(done, turned, bins, rng), seed + number)
+        found = again(replace(drawn, exposures=turned), number + 1)
         kept = replace(kept, runs=(*kept.runs, _shown_by(found, truth)))
         _keep(folder, kept)
     if causes and kept.cause is None and kept.doubtful:
-        kept = replace(kept, cause=compare_causes(coarse, again, on_progress))
+        rehearsed = drawn_frames(done, coarse, coarse.exposures, seed)
+        kept = replace(kept, cause=compare_causes(coarse, again, rehearsed, on_progress))
         _keep(folder, kept)
     on_progress("rehearsals", 1.0)
     return kept
@@ -361,7 +355,7 @@ def foresee(
     verdicts, runs = list[Verdict](), list[Mapping[str, Any]]()
     for number in range(times):
         on_progress(f"rehearsal {number + 1} of {times}", number / times)
-        turned = _turned(exposures, np.random.default_rng([0, number]).uniform(0, 360))
+        turned = turned_by(exposures, np.random.default_rng([0, number]).uniform(0, 360))
         scan = simulate(matter, turned, photons_per_pixel=photons, seed=number, is_test=all_train)
         found = reconstruct(scan, prior, method, seed=number)
         assert found.verdict is not None
@@ -382,37 +376,6 @@ def _shown_by(found: Reconstruction, truth: Volume) -> dict[str, Any]:
 def _told(done: Reconstruction, volume: Volume) -> Volume:
     """A volume with β in place of δ if a run does not tell δ."""
     return volume if done.delta_told else of_absorption(volume)
-
-
-def _turned(exposures: Exposures, degrees: float) -> Exposures:
-    """Views turned by `degrees` about the object: about the line along y through what all look at."""
-    views, by = exposures.views, rotation_y([degrees])[0]
-    middle = Grid.of_views(views).centre
-    rotations = views.rotations @ by
-    shifts = views.shifts + ((rotations - views.rotations) @ middle)[:, :2]
-    return replace(exposures, views=replace(views, rotations=rotations, shifts=shifts))
-
-
-def _quiet(done: Reconstruction, exposures: Exposures) -> np.ndarray:
-    """Frames [V, H, W] of a result without light and noise."""
-    with torch.no_grad():
-        return np.stack(list(simulated_frames(done.object, exposures, Simulation())))
-
-
-def _noise_and_light(done: Reconstruction, train: Scan) -> tuple[NoiseModel, np.ndarray]:
-    """Noise and light of the measured training frames at these pixels."""
-    lit = light_of(train, done.light, done.still)
-    if lit is None:
-        return NoiseModel.of_frames(train.measured), np.ones((1, 1, 1))
-    return lit.noise, lit.factor().numpy()
-
-
-def _doubts(done: Reconstruction, prior: MaterialPrior) -> dict[str, float]:
-    """What the scale of a quantity is at least: of the total the standard error that the run states, as a share; where
-    δ/β was estimated, that of δ/β, which rehearsals of one result take for true."""
-    ratio, total = ratio_doubt(prior, done.constants) if done.delta_told else 0.0, done.total
-    found = dict.fromkeys(("total", "delta", "error"), ratio) if ratio else {}
-    return found | ({"total": total.error / abs(total.value)} if total and total.value and total.error else {})
 
 
 def read_rehearsal(folder: RunFolder) -> Rehearsal | None:
