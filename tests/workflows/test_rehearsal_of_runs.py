@@ -181,9 +181,8 @@ def test_what_a_run_found_of_distance_energy_and_poses_is_drawn_from_its_errors(
         Determined(name, value, value / by, value * by, (value / 2, value * 2), True)
         for name, value, by in (("distance", 0.03, 1.2), ("energy_kev", 20.0, 1.02))
     )
-    searched = AlignedViews(
-        train, np.zeros((3, 7)), np.tile([0.5, 0.5, 0, 2.0, 0, 0, 0], (3, 1)), *np.zeros((3, 3)), (), ()
-    )
+    errors, none = np.tile([0.5, 0.5, 0, 2.0, 0, 0, 0], (3, 1)), np.zeros(3)
+    searched = AlignedViews(train, np.zeros((3, 7)), errors, none, none, none, ())
     geometry = Geometry.of_training(scan, searched, PosePrior())
     unsure = replace(done, constants=constants, geometry=geometry)
     drawn = [certainty.as_uncertain(unsure, train, 2, rng) for _ in range(400)]
