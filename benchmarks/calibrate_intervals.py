@@ -39,12 +39,12 @@ from holosplat.metrics import dice, robust_material_delta
 from holosplat.scan import Scan
 from holosplat.workflows.certainty import (
     FACTORS,
-    LEVEL,
     SIGNED,
     SIZES,
-    centre_and_scale,
     conformal_quantile,
     errors_of,
+    fitted_factor,
+    scale_of,
 )
 from holosplat.workflows.rehearsal import RESIDUAL, Rehearsal, rehearse
 
@@ -58,9 +58,9 @@ SEED = 7001
 VIEWS, WAYS, TIMES, TIMES_OF_MISTAKES = (3, 4, 6), ("ctf-tv", "holographic-tv"), 2, 2
 RIGHT = 0.95
 """Part of the right runs that are not called wrong."""
-NUMBERS = (*SIGNED, *SIZES, "resolution")
+NUMBERS = (*SIGNED, *SIZES)
 COLUMNS = ("scene", "family", "method", "views", "mistake", "good", "excess")
-COLUMNS += tuple(f"{name}_{what}" for name in NUMBERS for what in ("error", "centre", "scale"))
+COLUMNS += tuple(f"{name}_{what}" for name in NUMBERS for what in ("error", "scale"))
 COLUMNS += ("facts", "seconds", "machine", "commit")
 
 Mistake = Callable[[Scan, hs.MaterialPrior, np.random.Generator], tuple[Scan, hs.MaterialPrior]]
@@ -133,8 +133,7 @@ def rows_of(number: int) -> Iterator[dict[str, Any]]:
 def _numbers(shown: Rehearsal, errors: dict[str, float]) -> dict[str, str]:
     found = dict[str, str]()
     for name in NUMBERS:
-        centre, scale = centre_and_scale(name, shown.values(name))
-        for what, value in (("error", errors[name]), ("centre", centre), ("scale", scale)):
+        for what, value in (("error", errors[name]), ("scale", scale_of(name, shown.values(name)))):
             found[f"{name}_{what}"] = f"{value:.5g}"
     return found
 
@@ -173,20 +172,8 @@ def reliability() -> None:
 
 
 def columns_of(rows: Sequence[dict[str, Any]], name: str) -> np.ndarray:
-    """Errors, expected errors and scales of a quantity, [3, N]."""
-    return np.array([[float(row[f"{name}_{what}"]) for row in rows] for what in ("error", "centre", "scale")])
-
-
-def factor_of(rows: Sequence[dict[str, Any]], name: str) -> tuple[float, float]:
-    """The floor and the factor of a quantity."""
-    error, centre, scale = columns_of(rows, name)
-    floor = float(np.median(scale))
-    return floor, _quantile(np.abs(error - centre) / (scale + floor), LEVEL)
-
-
-def _quantile(scores: np.ndarray, level: float) -> float:
-    """The conformal quantile, or the largest of so few scores that there is none: then the level is n/(n + 1)."""
-    return min(conformal_quantile(scores, level), float(scores.max()))
+    """Errors and scales of a quantity, [2, N]."""
+    return np.array([[float(row[f"{name}_{what}"]) for row in rows] for what in ("error", "scale")])
 
 
 def summary() -> None:
@@ -194,20 +181,20 @@ def summary() -> None:
     rows = [row for row in read(PAGE) if row["excess"]]
     right, wrong = [r for r in rows if not r["mistake"]], [r for r in rows if r["mistake"]]
     excess = np.array([float(row["excess"]) for row in right])
-    limit = _quantile(excess, RIGHT)
+    limit = min(conformal_quantile(excess, RIGHT), float(excess.max()))
     parts = [f"# {len(right)} right runs; made by benchmarks/calibrate_intervals.py --summary from {PAGE.name}\n"]
     lines = list[dict[str, str]]()
     families = sorted({row["family"] for row in right})
     for name in NUMBERS:
-        floor, factor = factor_of(right, name)
+        floor, factor = fitted_factor(*columns_of(right, name))
         parts.append(f"[{name}]\nfloor = {floor:.4g}\nfactor = {factor:.4g}\nscenes = {len(right)}\n")
         inside = dict[str, list[bool]]()
         for family in families:
             others = [row for row in right if row["family"] != family]
             own = [row for row in right if row["family"] == family]
-            own_floor, own_factor = factor_of(others, name)
-            error, centre, scale = columns_of(own, name)
-            inside[family] = (np.abs(error - centre) <= own_factor * (scale + own_floor)).tolist()
+            own_floor, own_factor = fitted_factor(*columns_of(others, name))
+            error, scale = columns_of(own, name)
+            inside[family] = (np.abs(error) <= own_factor * (scale + own_floor)).tolist()
         every = [one for each in inside.values() for one in each]
         for family, each in {"all": every, **inside}.items():
             lines.append(_line(name, family, len(each), sum(each), factor))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import shutil
 
 import h5py
@@ -12,6 +13,7 @@ import holosplat as hs
 from helpers.cli import holosplat, refused, worked
 from holosplat.cli import view
 from holosplat.io.atomic import read_json, write_json
+from holosplat.methods.volume import SmoothVolume
 from holosplat.show.parts import LEVEL, likely_surfaces
 from holosplat.workflows import certainty, rehearsal
 
@@ -47,6 +49,39 @@ def test_intervals_are_printed_and_kept(run, monkeypatch):
     worked(holosplat("check", run))
     again = worked(holosplat("rehearse", run, "--times", 2))
     assert again.out == said.out
+    about = worked(holosplat("info", run)).out
+    assert said.out.splitlines()[0] in about
+    assert "Dice: at least" in about
+    page = run.parent / "compared.html"
+    compared = worked(holosplat("compare", run, run, "--out", page)).out
+    trusted = {"consistent": "Both explain", "limited": "as good as its method gets", "wrong": "Trust neither"}
+    assert trusted[table["word"]] in compared
+
+
+def test_all_times_of_a_series_are_rehearsed_and_those_that_began_warm_from_their_frames_alone(
+    run, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(certainty, "MISTAKES", {})
+    series, rows = tmp_path / "series", tmp_path / "series" / "series.csv"
+    scans = [shutil.copy(run.parent / "scan.nxs", tmp_path / name) for name in ("1.nxs", "2.nxs")]
+    how = ("--method", "volume", "--material", "water", "--set", "volume.iterations=4")
+    worked(holosplat("series", "plan", *scans, "--out", series, *how))
+    worked(holosplat("series", "run", series))
+    began = []
+    real = rehearsal.Again
+    monkeypatch.setattr(
+        rehearsal, "Again", lambda prior, method, *more: began.append(method) or real(prior, method, *more)
+    )
+    worked(holosplat("rehearse", series, "--times", 2))
+    assert [type(method) for method in began] == [SmoothVolume] * 2
+    with rows.open(newline="", encoding="utf-8") as file:
+        found = list(csv.DictReader(file))
+    for row in found:
+        said = rehearsal.read_rehearsal(hs.RunFolder(series / row["run"]))
+        assert said is not None
+        assert row["rehearsed"] == said.word
+        assert float(row["dice_at_least"]) == pytest.approx(said.least_dice, rel=1e-5)
+        assert float(row["total_low_m3"]) < float(row["total_m3"]) < float(row["total_high_m3"])
 
 
 def test_the_map_of_matter_is_exported_and_viewed(run, tmp_path, monkeypatch):

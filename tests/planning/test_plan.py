@@ -277,3 +277,6 @@ def test_the_experiment_of_a_plan_is_as_wide_as_object_and_fringes_on_joined_pix
     assert tuple(scene.materials[0]) == tuple(CELL.contrast(20.0))
     small = experiment(CELL, setup, Recording(100.0, 5, (11, 19)), 20)[1]
     assert small.views.shape == (11, 19)
+    coarse = replace(setup, pixel_size=5e-6)
+    assert max(experiment(CELL, coarse, Recording(100.0, 5), 20)[1].views.shape) < 11
+    assert experiment(CELL, coarse, Recording(100.0, 5, (8, 30)), 20, 11)[1].views.shape == (8, 11)

@@ -200,9 +200,10 @@ def plan(
 def _foreseen(subject: Subject, setup: Setup, recording: Recording, times: int) -> Rehearsal:
     from ..matter import MaterialPrior
     from ..methods import METHODS
+    from ..workflows.preconditions import FEWEST_COLUMNS
     from ..workflows.rehearsal import SIDE, foresee
 
-    scene, exposures, photons = experiment(subject, setup, recording, SIDE)
+    scene, exposures, photons = experiment(subject, setup, recording, SIDE, FEWEST_COLUMNS)
     prior = MaterialPrior.known(subject.contrast(setup.energy_kev))
     with ProgressBar() as bar:
         method = METHODS["holographic-tv"]

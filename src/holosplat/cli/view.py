@@ -208,28 +208,50 @@ def _side(path: Path) -> Side:
 def rehearse(run: Positional[Path], times: Many = 8, bins: Many | None = None, reading: Reading = Reading()) -> None:
     """Say how sure the numbers of a run are: simulate its frames, reconstruct them likewise, and compare.
 
-    The intervals and the verdict join summary.json and the report. Rehearsals that are there are not made again.
+    The intervals and the verdict join summary.json and the report. Rehearsals that are there are not made again. Of a
+    series, every time that is done is rehearsed, and its table is written again.
 
     Args:
-        run: Run folder.
+        run: Run folder, or folder of a series of single times.
         times: Rehearsals, 2 or more.
         bins: Pixels joined along an edge, for speed (default: to about 48 pixels along the shorter side).
     """
+    from ..series.collect import collect
+    from ..series.folder import SeriesFolder
+    from ..workflows.run_folder import RunFolder
+    from .scans import runs_of
+
+    each = runs_of(run)
+    for number, (_, folder) in enumerate(each):
+        if folder.result().is_file():
+            say(f"time {number}:")
+            _rehearse(folder, times, bins, reading)
+    if each:
+        collect(series := SeriesFolder(run))
+        say(f"wrote {series.table}")
+    else:
+        _rehearse(RunFolder(run), times, bins, reading)
+
+
+def _rehearse(folder: RunFolder, times: int, bins: int | None, reading: Reading) -> None:
+    from ..methods.continued import Continued
     from ..methods.presets import method_of
     from ..methods.solve import Settled
     from ..report.run import report_run
     from ..series.plan import prior_of
+    from ..tables import from_table
     from ..workflows.evaluate import evaluate as score
     from ..workflows.rehearsal import rehearse as repeat
-    from ..workflows.run_folder import RunFolder, claimed
+    from ..workflows.run_folder import claimed
     from .progress import ProgressBar
     from .scans import run_and_scan
 
-    folder = RunFolder(run)
     result, measured = run_and_scan(folder, None, reading)
     config = folder.read_config()
     with as_written(folder.config, "what reconstruct wrote"):
-        method = Settled.again(method_of(dict(config["method"]), "method"), config["decided"]).method
+        told = dict(config["method"])
+        method = from_table(Continued, told) if told.get("kind") == Continued.kind else method_of(told, "method")
+        method = Settled.again(method, config["decided"]).method
         prior, seed = prior_of(config["prior"]), int(config["seed"])
     with claimed(folder):
         with ProgressBar() as bar:

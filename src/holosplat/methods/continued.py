@@ -72,6 +72,10 @@ class Continued(Method):
             "choose one of these."
         )
 
+    def afresh(self, found: Stored) -> Method:
+        """What makes an object of the kind of `found` from frames alone."""
+        return self.volume if isinstance(found, VoxelGrid) else Auto(self.gaussians, self.surfaces)
+
     @property
     def wants_levels(self) -> bool:
         """It does not matter."""

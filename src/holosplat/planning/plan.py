@@ -264,14 +264,18 @@ def _storage(setup: Setup, recording: Recording) -> Storage:
     return Storage(rate, instant * recording.frames, shape, volume, volume * recording.frames)
 
 
-def experiment(subject: Subject, setup: Setup, recording: Recording, side: int) -> tuple[MeshScene, Exposures, float]:
+def experiment(
+    subject: Subject, setup: Setup, recording: Recording, side: int, least: int = 1
+) -> tuple[MeshScene, Exposures, float]:
     """The object, its exposures, and their photons a pixel: of the detector, but no more of it than holds the object
-    and four fringes at any turn about y, on pixels joined until `side` of them lie along the shorter side."""
+    and four fringes at any turn about y, and `least` pixels along each side, on pixels joined until `side` of them lie
+    along the shorter side."""
     from ..specimens.scene import MeshScene  # with torch, which takes long to load
 
     x, y, z = subject.extent
     field = np.array([y, math.hypot(x, z)]) + 4 * setup.fringe
-    pixels = np.minimum(np.ceil(field / setup.pixel_size), recording.detector or np.inf).astype(int)
+    wanted = np.maximum(np.ceil(field / setup.pixel_size), least)
+    pixels = np.minimum(wanted, recording.detector or np.inf).astype(int)
     joined = max(1, int(pixels.min()) // side)
     rows, columns = (max(1, int(n) // joined) for n in pixels)
     views = Views.evenly_spaced(recording.views, (rows, columns), joined * setup.pixel_size)

@@ -26,6 +26,7 @@ from ..workflows.evaluate import Evaluation, evaluate, of_absorption
 from ..workflows.provenance import CONFIG_SUM, RUN
 from ..workflows.reconstruct import load_reconstruction
 from ..workflows.reconstruction import Reconstruction, instants_of, reconstruction_at
+from ..workflows.rehearsal import read_rehearsal
 from ..workflows.run_folder import RunFolder
 from .content import DELTA, Quantity, flatten
 from .curves import correlation_figure
@@ -120,12 +121,13 @@ class Comparison:
 
     def verdict(self) -> str:
         """The comparison in a sentence or two."""
-        good = [side.result.verdict and side.result.verdict.good for side in self.sides]
-        doubted = [name for name, each in zip("AB", good) if each is False]
+        words = [_word(side) for side in self.sides]
+        doubted, limited = ([name for name, each in zip("AB", words) if each == one] for one in ("wrong", "limited"))
         said = {0: "", 1: f"Do not trust {' and '.join(doubted)}: its frames are not explained. "}
         text = said.get(len(doubted), "Trust neither A nor B: the frames of both are not explained. ")
-        if all(good):
+        if words == ["consistent"] * 2:
             text = "Both explain their frames. "
+        text += "".join(f"{name} is as good as its method gets with these views. " for name in limited)
         if self.scores is None:
             return f"{text}One of the volumes is empty, so there is nothing to compare."
         error = in_percent(self.scores.relative_error_delta)
@@ -141,6 +143,7 @@ class Comparison:
             ("photon energy or wavelength", lambda side: beam_named(side.result.energy_kev)[1]),
             ("verdict", lambda side: in_print(side.result.verdict.words) if side.result.verdict else "not judged"),
             ("likely cause", _cause),
+            ("by rehearsals", lambda side: in_print(found.said) if (found := read_rehearsal(side.folder)) else "–"),
             ("total", lambda side: in_print(side.result.total.words) if side.result.total else "–"),
             *(
                 (f"{label} of {frames} frames", lambda side, part=part, name=name: side.score(part, name))
@@ -240,6 +243,14 @@ def chosen(decisions: Sequence[Decision]) -> dict[str, str]:
     for each in decisions:
         found[each.name] = f"{found[each.name]}, {each.choice}" if each.name in found else each.choice
     return found
+
+
+def _word(side: Side) -> str:
+    """The verdict by rehearsals, or without them that on the frames alone; empty where nothing was judged."""
+    found, frames = read_rehearsal(side.folder), side.result.verdict
+    if found is not None:
+        return found.word
+    return "" if frames is None else "consistent" if frames.good else "wrong"
 
 
 def _cause(side: Side) -> str:

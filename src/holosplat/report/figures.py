@@ -17,7 +17,7 @@ from ..frames import evenly
 from ..geometry import Grid
 from ..units import in_percent, length_unit, plain, wavenumber
 from ..volume import Volume
-from ..workflows.certainty import MatterMap
+from ..workflows.matter_map import MatterMap
 from .content import DELTA, HeldOutViews, ProjectedMaps, Quantity, pixel_of
 from .style import (
     BETA_MAP,

@@ -127,6 +127,8 @@ def _of_run(folder: RunFolder) -> Facts:
             f"holosplat export {folder.path} --volume v.h5",
         ]
         commands += [f"holosplat view {folder.path}"]
+        if "verdict" in summary and "rehearsal" not in summary:
+            commands += [f"holosplat rehearse {folder.path}"]
     missing = [] if source else [f"{folder.path} does not say which scan it is of; name it with --scan."]
     return Facts(rows, tuple(missing), tuple(commands))
 
@@ -142,6 +144,8 @@ def _result(summary: dict) -> dict[str, str]:
         rows["frames"] = f"{size} at {beam_named(summary['energy_kev'])[1]}" if "energy_kev" in summary else size
     rows["verdict"] = verdict.get("words", "none was made")
     rows |= {f"verdict {n}": text for n, text in enumerate(verdict.get("reasons", ()), 1)}
+    said = summary.get("rehearsal", {}).get("words", ())
+    rows |= {f"rehearsed {n}".removesuffix(" 0"): text.strip() for n, text in enumerate(said)}
     judged = Choice.read(summary).judged
     shares = ", ".join(f"{name} {in_percent(float(share))}" for name, share in judged.items())
     rows |= {"scores": f"matter that training frames leave unexplained: {shares}"} if shares else {}

@@ -15,6 +15,7 @@ from ..io.atomic import write_rows
 from ..io.objects import read_object
 from ..tables import number_in
 from ..workflows.motion_choice import begun_motion
+from ..workflows.rehearsal import read_rehearsal
 from ..workflows.run_folder import RunFolder
 from ..workflows.totals import TotalMatter
 from .events import EVENT_COLUMNS, PARTS, TRACK_COLUMNS, History, Parts
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 COLUMNS = (
     *("number", "scan", "frame", "time_s", "task", "status", "begun", "kind", "explained", "unexplained"),
     *("test_ssim", "test_frcm", "train_ssim", "train_frcm", "total_m3", "total_error_m3", "bodies", "seconds"),
+    *("rehearsed", "total_low_m3", "total_high_m3", "dice_at_least"),
     *("run", "reason", "decided", "verdict"),
 )
 BODY_COLUMNS = ("number", "time_s", "body", "x_m", "y_m", "z_m", "volume_m3")
@@ -195,7 +197,25 @@ def _lines(folder: SeriesFolder, found: Collected) -> Iterable[list[object]]:
         scores = [_number(part.get(name)) for part in (row.test, row.train) for name in ("ssim", "frcm")]
         said = [row.begun, row.kind, "" if row.good is None else int(row.good), _number(row.unexplained), *scores]
         told = [_number(row.total), _number(row.total_error), len(row.bodies), f"{row.seconds:.3f}"]
-        yield [*where, "done", *said, *told, run.relative_to(folder.path).as_posix(), "", row.decided, row.words]
+        yield [
+            *where,
+            "done",
+            *said,
+            *told,
+            *_rehearsed(run),
+            run.relative_to(folder.path).as_posix(),
+            "",
+            row.decided,
+            row.words,
+        ]
+
+
+def _rehearsed(run: Path) -> list[str]:
+    """The verdict by rehearsals of a run, and the ends of what they say; empty where none were made."""
+    found = read_rehearsal(RunFolder(run))
+    if found is None:
+        return [""] * 4
+    return [found.word, *(f"{each:.6g}" for each in (*found.total_ends, found.least_dice))]
 
 
 def _body_lines(found: Collected) -> Iterable[list[object]]:

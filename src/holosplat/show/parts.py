@@ -15,7 +15,7 @@ from ..matter import Matter
 from ..mesh import TriangleMesh
 from ..representations import GaussianCloud, InMotion, Stored, SurfaceMesh, VoxelGrid, isosurface
 from ..units import bar_length, format_length
-from ..workflows.certainty import MatterMap
+from ..workflows.matter_map import MatterMap
 
 HALF_EDGE = 10.0
 """Units of the scene from its middle to its farthest side, which suits the cameras of viewers."""

@@ -1,5 +1,5 @@
-"""Errors of a reconstruction's numbers, factors of their intervals, the probability that a voxel is matter, and
-reconstructions like one that was made, by which mistakes in the metadata of a scan are compared on held-out frames."""
+"""Errors of a reconstruction's numbers, factors of their intervals, frames like the measured ones, and reconstructions
+like one that was made, by which mistakes in the metadata of a scan are compared on held-out frames."""
 
 from __future__ import annotations
 
@@ -14,19 +14,21 @@ import numpy as np
 import torch
 
 from ..align import find_axis
-from ..checks import InputError, require, shaped
+from ..beamline.simulate import Simulation, simulated_frames
+from ..checks import InputError, require
 from ..geometry import Grid, rotation_y
-from ..inference import Decision, Score, select
+from ..inference import Compared, Decision, Score, select
 from ..matter import DeltaBeta, MaterialPrior
 from ..methods import Method, Uncertain
 from ..methods.cross_validation import predicted_frames
 from ..methods.illumination import CORRELATED, STAGE
-from ..metrics import robust_material_delta, volume_scores
-from ..metrics.volumes import require_same_grid
+from ..metrics import volume_scores
+from ..model.alignment import Alignment
 from ..optics.background import LightOptions
+from ..optics.noise import NoiseModel
 from ..progress import Progress
 from ..rotations import angles_about_y
-from ..scan import Scan, interleaved_split
+from ..scan import Exposures, Scan, interleaved_split
 from ..tables import overridden, paths, read_table
 from ..volume import Volume
 from .evaluate import of_absorption
@@ -34,6 +36,7 @@ from .next_step import STIFF
 from .reconstruct import reconstruct
 from .reconstruction import Reconstruction
 from .run_illumination import light_of
+from .totals import ratio_doubt
 
 FACTORS = Path(__file__).with_name("conformal.toml")
 """Factors of stated errors, with the scenes that they are of: benchmarks/calibrate_intervals.py."""
@@ -45,8 +48,8 @@ LEVEL = 0.9
 class Factor:
     """How a quantity of rehearsals becomes an interval that holds the truth in `LEVEL` of the calibration's scenes.
 
-    floor: median of the quantity's scale over the scenes, added to that of a run: a scale near 0 promises too much
-    (Papadopoulos et al. 2008, normalised nonconformity); factor: of the sum of both
+    floor: added to the scale of a run, for one near 0 promises too much (Papadopoulos et al. 2008, normalised
+    nonconformity); factor: of the sum of both
     """
 
     floor: float
@@ -67,30 +70,49 @@ def conformal_quantile(scores: np.ndarray, level: float) -> float:
     return float(np.sort(scores)[rank - 1]) if rank <= len(scores) else math.inf
 
 
-SIGNED, SIZES = ("total", "delta", "volume"), ("centre", "dice", "error")
-"""Quantities with errors of either sign, as shares; and sizes of errors: of the centre of mass [pixels], 1 - Dice, and
-the relative error of δ. Beside them stands `resolution`, the logarithm of a length over two pixels."""
+def fitted_factor(errors: np.ndarray, scales: np.ndarray) -> tuple[float, float]:
+    """The floor and the factor of a quantity by its errors [N] and its scales [N] in N scenes.
 
-
-def centre_and_scale(name: str, values: np.ndarray) -> tuple[float, float]:
-    """Where a quantity's error is expected by its values in rehearsals [K], and how far off that may be.
-
-    Resolutions at the limit of the sampling have no spread, so that all runs have the same scale.
+    Each floor, of the scales that there are, makes intervals that cover `LEVEL` of the scenes: that of the least mean
+    logarithm of the length is taken (efficiency; Vovk et al. 2016, COPA). Of so few scenes that there is no quantile,
+    the factor is the largest score; then the level is n/(n + 1).
     """
-    if name == "resolution":
-        return float(values.mean()), 1.0
-    return 0.0, float(np.sqrt(np.square(values).mean()))
+    sizes, found = np.abs(errors), list[tuple[float, float, float]]()
+    for floor in np.unique(scales[scales > 0]):
+        scores = sizes / (scales + floor)
+        factor = min(conformal_quantile(scores, LEVEL), float(scores.max()))
+        found.append((float(np.log(factor * (scales + floor)).mean()), float(floor), factor))
+    return min(found)[1:]
+
+
+SIGNED, SIZES = ("total", "delta", "volume"), ("centre", "dice", "error", "resolution")
+"""Quantities with errors of either sign, as shares; and sizes of errors: of the centre of mass [pixels], 1 - Dice, the
+relative error of δ, and the logarithm of the resolution over two pixels."""
+
+
+def scale_of(name: str, values: np.ndarray) -> float:
+    """How far off a quantity may be by its values in rehearsals [K]: their root mean square; of the resolution, whose
+    logarithm is 0 or large, the mean."""
+    return float(values.mean() if name == "resolution" else np.sqrt(np.square(values).mean()))
+
+
+def true_sizes(found: float, low: float, high: float) -> tuple[float, float]:
+    """The least and the largest positive value whose measurement `found` has an error, as a share, of `low` to `high`;
+    a measurement of the wrong sign says nothing of the size."""
+    if found <= 0:
+        return 0.0, math.inf
+    return found / (1 + high), found / (1 + low) if low > -1 else math.inf
 
 
 def errors_of(found: Reconstruction, truth: Volume) -> dict[str, float]:
-    """The quantities `SIGNED`, `SIZES` and `resolution` of a reconstruction against the true volume on its grid."""
+    """The quantities `SIGNED` and `SIZES` of a reconstruction against the true volume on its grid."""
     volume = found.object.voxelise(truth.grid)
     volume, truth = (volume, truth) if found.delta_told else (of_absorption(volume), of_absorption(truth))
     scores, cell = volume_scores(volume, truth), math.prod(truth.grid.voxel_size)
     stated = None if found.total is None else found.total.value
     true = float(truth.delta.sum(dtype=np.float64)) * cell
     size = float(np.abs(truth.delta).sum(dtype=np.float64)) * cell
-    stated = float(volume.delta.sum(dtype=np.float64)) * cell if stated is None else math.copysign(stated, true)
+    stated = float(volume.delta.sum(dtype=np.float64)) * cell if stated is None else stated
     widest, resolution = max(truth.grid.shape) / 2, scores.resolution_half_bit
     periods = 1.0 if resolution is None else min(resolution / (2 * scores.pitch), widest)
     matter, true_matter = (each.delta / scores.material_delta > 0.5 for each in (volume, truth))
@@ -130,6 +152,59 @@ class Again:
         light = light if done.still is None else LightOptions()  # which finds the fixed pattern, too
         how = {"prior": self.prior, "method": self.method, "light": light, "matter": done.choice.matter}
         return reconstruct(scan, seed=self.seed + further, **(how | changed))
+
+
+def as_uncertain(done: Reconstruction, exposures: Exposures, bins: int, rng: np.random.Generator) -> Exposures:
+    """`exposures` [V] of the training frames, on pixels joined `bins` × `bins`, where they may as well be: distance and
+    energy are drawn from the intervals of a run's `constants` (95 %, as logarithms), poses from the standard errors of
+    its `geometry`. Without either they are as given."""
+    for each in done.constants:
+        if each.name in ("distance", "energy_kev"):
+            factor = math.exp(0.25 * math.log(each.high / each.low) * rng.normal())
+            known = getattr(exposures, each.name)
+            reference = None if each.name == "energy_kev" else exposures.reference_kev
+            changed = {each.name: np.clip(known * factor, *each.given), "reference_kev": reference}
+            exposures = replace(exposures, **changed)
+    if done.geometry is None:
+        return exposures
+    errors = np.nan_to_num(done.geometry.errors[~done.geometry.held_out])
+    away = torch.from_numpy(errors * rng.normal(size=errors.shape))
+    shifts, turns, larger = away[:, :2] / bins, torch.deg2rad(away[:, 2:5]), away[:, 6]
+    return Alignment(turns, shifts, away[:, 5], magnified=larger if larger.any() else None).exposures(exposures)
+
+
+def turned_by(exposures: Exposures, degrees: float) -> Exposures:
+    """Views turned by `degrees` about the object: about the line along y through what all look at."""
+    views, by = exposures.views, rotation_y([degrees])[0]
+    middle = Grid.of_views(views).centre
+    rotations = views.rotations @ by
+    shifts = views.shifts + ((rotations - views.rotations) @ middle)[:, :2]
+    return replace(exposures, views=replace(views, rotations=rotations, shifts=shifts))
+
+
+def drawn_frames(done: Reconstruction, scan: Scan, exposures: Exposures, seed: int) -> Scan:
+    """`scan` with frames of a result as `exposures` see it, in the light and noise of the measured ones."""
+    noise, factor = _noise_and_light(done, scan)
+    with torch.no_grad():
+        quiet = np.stack(list(simulated_frames(done.object, exposures, Simulation())))
+    frames = quiet * factor + noise.drawn(seed).numpy() * np.sqrt(np.clip(quiet, 0, None))
+    return replace(scan, frames=frames.astype(np.float32))
+
+
+def _noise_and_light(done: Reconstruction, scan: Scan) -> tuple[NoiseModel, np.ndarray]:
+    """Noise and light of measured frames at these pixels."""
+    lit = light_of(scan, done.light, done.still)
+    if lit is None:
+        return NoiseModel.of_frames(scan.measured), np.ones((1, 1, 1))
+    return lit.noise, lit.factor().numpy()
+
+
+def doubts_of(done: Reconstruction, prior: MaterialPrior) -> dict[str, float]:
+    """What the scale of a quantity is at least: of the total the standard error that the run states, as a share; where
+    δ/β was estimated, that of δ/β, which rehearsals of one result take for true."""
+    ratio, total = ratio_doubt(prior, done.constants) if done.delta_told else 0.0, done.total
+    found = dict.fromkeys(("total", "delta", "error"), ratio) if ratio else {}
+    return found | ({"total": total.error / abs(total.value)} if total and total.value and total.error else {})
 
 
 NULL = "metadata as given"
@@ -217,17 +292,40 @@ MISTAKES: Mapping[str, tuple[str, Change]] = {
 """Mistakes from simple to complex: each with the key of `STEPS`, and what puts it right."""
 
 
-def compare_causes(scan: Scan, again: Again, on_progress: Progress = lambda stage, fraction: None) -> Decision:
+def compare_causes(
+    scan: Scan, again: Again, rehearsed: Scan | None = None, on_progress: Progress = lambda stage, fraction: None
+) -> Decision:
     """Which of `MISTAKES`, put right, predicts held-out frames better than the metadata as given, the null.
 
+    rehearsed: the same frames, simulated of the result; there the metadata are right, so that what predicts better
+    there, too, mends the method, and is no mistake
     Without held-out frames, every fourth one is held out. Another sense of rotation is none of the mistakes: the
     mirrored object gives the same frames. The choice is a key of `STEPS`, or the null.
     """
     if len(scan) < FEWEST:
         return Decision(NAME, NULL, f"fewer than {FEWEST} frames, of which none can be held out")
-    scan = scan if scan.is_test.any() else replace(scan, is_test=interleaved_split(len(scan)))
     keys = {name: key for name, (key, _) in MISTAKES.items()} | {NULL: NULL}
-    order = list(MISTAKES)
+    order, score = list(MISTAKES), _unseen(scan, again)
+    scores = [score] if rehearsed is None else [score, _unseen(rehearsed, again)]
+    possible, mends = [NULL], list[str]()
+    for number, name in enumerate(order):
+        on_progress(f"cause: {name}", number / len(order))
+        try:
+            gains = (of(name).gain_over(of(NULL)) for of in scores)
+            if all(Compared(name, *gain).wins for gain in gains) and rehearsed is not None:
+                mends.append(name)
+                continue
+        except InputError:  # this mistake cannot have been made here
+            continue
+        possible.append(name)
+    by = BY + (f"; in rehearsals, too: {', '.join(mends)}" if mends else "")
+    decision = select(NAME, possible, lambda name, fold: score(name), by=by)
+    return replace(decision, choice=keys[decision.choice])
+
+
+def _unseen(scan: Scan, again: Again) -> Callable[[str], Score]:
+    """What reconstructions of a scan leave of its held-out frames, with the mistake of a name put right."""
+    scan = scan if scan.is_test.any() else replace(scan, is_test=interleaved_split(len(scan)))
 
     @cache
     def score(name: str) -> Score:
@@ -239,90 +337,4 @@ def compare_causes(scan: Scan, again: Again, on_progress: Progress = lambda stag
         lamp = 1.0 if lit is None else lit.factor()[torch.from_numpy(scan.is_test)].to(predicted)
         return Score.of(test.left(predicted * lamp))
 
-    possible = [NULL]
-    for number, name in enumerate(order):
-        on_progress(f"cause: {name}", number / len(order))
-        try:
-            score(name)
-        except InputError:  # this mistake cannot have been made here
-            continue
-        possible.append(name)
-    decision = select(NAME, possible, lambda name, fold: score(name), by=BY)
-    return replace(decision, choice=keys[decision.choice])
-
-
-BINS = np.linspace(-0.5, 1.5, 41)
-"""Ends of the bins in which occupancies are counted; those beyond count in the outermost bins."""
-VOXELS, MATTER = "voxels", "matter"
-
-
-def _bins_of(occupancies: np.ndarray) -> np.ndarray:
-    return np.clip(np.digitize(occupancies, BINS) - 1, 0, len(BINS) - 2)
-
-
-def occupancy_counts(found: Volume, truth: Volume) -> dict[str, list[float]]:
-    """How many voxels of a reconstruction have an occupancy in each of the `BINS` [N], and of how many the truth, on
-    the same grid, is matter [N]. Occupancy and matter are those of `metrics.volumes`, with the δ of the true material.
-
-    Errors: `InputError` for other grids, and for a truth without matter.
-    """
-    require_same_grid(found.grid, truth.grid)
-    unit = robust_material_delta(truth)
-    which, matter = _bins_of(found.delta / unit), truth.delta / unit > 0.5
-    counts = (np.bincount(each.ravel(), minlength=len(BINS) - 1) for each in (which, which[matter]))
-    return {name: each.astype(float).tolist() for name, each in zip((VOXELS, MATTER), counts)}
-
-
-def matter_probabilities(voxels: np.ndarray, matter: np.ndarray) -> np.ndarray:
-    """Probabilities [N] that voxels of occupancies in N ascending bins are matter, where `matter` [N] of `voxels` [N]
-    were.
-
-    They are the shares (m + ½)/(n + 1), of Jeffreys' prior, and made to rise with occupancy by joining adjacent bins,
-    which is their weighted least-squares fit (Ayer et al. 1955; as calibration: Zadrozny & Elkan 2002, KDD). Errors:
-    `InputError` for counts that differ in length, and for more matter than voxels.
-    """
-    shaped("counts of matter", matter, np.shape(voxels))
-    require(bool((matter <= voxels).all()), "voxels of matter must be among those counted, but there are more of them.")
-    joined = list[tuple[float, float, int]]()
-    for one in zip(matter + 0.5, voxels + 1.0, [1] * len(voxels)):
-        while joined and joined[-1][0] * one[1] >= one[0] * joined[-1][1]:
-            before = joined.pop()
-            one = (before[0] + one[0], before[1] + one[1], before[2] + one[2])
-        joined.append(one)
-    return np.repeat([true / every for true, every, _ in joined], [many for *_, many in joined])
-
-
-@dataclass(frozen=True)
-class MatterMap:
-    """The probability that a voxel is matter, given its occupancy.
-
-    found: the reconstruction whose voxels are judged; unit: the δ of its material; table: [N] probabilities by `BINS`
-    """
-
-    found: Volume
-    unit: float
-    table: np.ndarray
-
-    @property
-    def values(self) -> np.ndarray:
-        """Probabilities [Z, Y, X] float32."""
-        return self.table[_bins_of(self.found.delta / self.unit)].astype(np.float32)
-
-    def on(self, grid: Grid) -> np.ndarray:
-        """Probabilities on another grid, [Z, Y, X] float32, linear between voxels; beyond the map those of its edge."""
-        from scipy.ndimage import map_coordinates  # which takes long to load
-
-        own = self.found.grid
-        places = [
-            (axis - start) / edge
-            for axis, start, edge in zip(grid.axes()[::-1], own.origin[::-1], own.voxel_size[::-1])
-        ]
-        return map_coordinates(self.values, np.meshgrid(*places, indexing="ij"), order=1, mode="nearest")
-
-    @property
-    def expected_dice(self) -> float:
-        """Dice expected of the voxels beyond half of the material's δ: 2 Σ_M p / (|M| + Σ p), the ratio of expected
-        overlap and sizes; nan without matter and chance of it."""
-        values, matter = self.values.astype(np.float64), self.found.delta / self.unit > 0.5
-        sizes = float(matter.sum() + values.sum())
-        return 2 * float(values[matter].sum()) / sizes if sizes else math.nan
+    return score

@@ -11,7 +11,7 @@ from ..io.volumes import LIKELY, SEEN
 from ..optics.sampling import views_seeing
 from ..progress import Advance
 from ..scan import Exposures
-from .certainty import MatterMap
+from .matter_map import MatterMap
 from .reconstruction import Reconstruction
 
 

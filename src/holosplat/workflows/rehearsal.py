@@ -7,21 +7,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
-import torch
 
-from ..beamline.simulate import Simulation, simulate, simulated_frames
+from ..beamline.simulate import simulate
 from ..checks import InputError, as_written, require
-from ..geometry import Grid, rotation_y
+from ..geometry import Grid
 from ..inference import Decision
 from ..io.volumes import read_volume, write_volume
 from ..matter import MaterialPrior
 from ..methods import Auto, Method
+from ..methods.continued import Continued
 from ..metrics import robust_material_delta
-from ..optics.noise import NoiseModel
 from ..progress import Progress
 from ..representations import InMotion
 from ..scan import Exposures, Scan
@@ -29,26 +28,26 @@ from ..units import in_percent, two_digits
 from ..volume import Object, Volume
 from .certainty import (
     LEVEL,
-    MATTER,
     NULL,
     SIGNED,
     SIZES,
-    VOXELS,
     Again,
-    MatterMap,
-    centre_and_scale,
+    as_uncertain,
     compare_causes,
+    doubts_of,
+    drawn_frames,
     errors_of,
     factors,
-    matter_probabilities,
-    occupancy_counts,
+    scale_of,
+    true_sizes,
+    turned_by,
 )
 from .evaluate import of_absorption
+from .matter_map import MATTER, VOXELS, MatterMap, matter_probabilities, occupancy_counts
 from .next_step import next_step
 from .reconstruct import reconstruct
 from .reconstruction import Reconstruction
 from .run_folder import RunFolder
-from .run_illumination import light_of
 from .verdict import Verdict
 
 SIDE = 48
@@ -79,6 +78,7 @@ class Rehearsal:
     pixels, with β in place of an unknown δ; None if it was not kept
     total: that the run states [m³], None for none; quantity: of which index
     cause: between the metadata as given, the null, and mistakes in them; None where the residual gave no reason
+    doubts: standard errors, as shares, of what rehearsals do not show (`doubts_of`), by quantity
     """
 
     binned: int
@@ -90,16 +90,17 @@ class Rehearsal:
     total: float | None = None
     quantity: str = "δ"
     cause: Decision | None = None
+    doubts: Mapping[str, float] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, ready for JSON, with what they say; `from_dict` reads them."""
         plain = {"binned": self.binned, "pixel_m": self.pixel, "unit": self.unit}
         plain |= {"explained": self.explained.as_dict()}
         plain |= {"runs": list(self.runs), "total_m3": self.total, "quantity": self.quantity}
-        plain |= {"cause": self.cause and self.cause.as_dict()}
+        plain |= {"cause": self.cause and self.cause.as_dict(), "doubts": dict(self.doubts)}
         if len(self.runs) < FEWEST:
             return plain
-        said = {name: list(self.interval(name)) for name in (*SIGNED, *SIZES, "resolution")}
+        said = {name: list(self.interval(name)) for name in (*SIGNED, *SIZES)}
         return plain | {"word": self.word, "intervals_of_errors": said, "words": self.lines()}
 
     @classmethod
@@ -117,6 +118,7 @@ class Rehearsal:
                 None if total is None else float(total),
                 str(values["quantity"]),
                 None if cause is None else Decision.from_dict(cause),
+                {name: float(value) for name, value in values.get("doubts", {}).items()},
             )
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise InputError(f"a rehearsal must be what rehearse wrote, but it lacks or garbles {error}.") from error
@@ -127,10 +129,21 @@ class Rehearsal:
 
     def interval(self, name: str) -> tuple[float, float]:
         """Ends of the interval of a quantity's error; that of a size begins at 0."""
-        centre, scale = centre_and_scale(name, self.values(name))
-        of = factors()[name]
-        reach = of.factor * (scale + of.floor)
-        return (0.0 if name in SIZES else centre - reach), centre + reach
+        of, scale = factors()[name], scale_of(name, self.values(name))
+        reach = of.factor * (max(scale, self.doubts.get(name, 0.0)) + of.floor)
+        return 0.0 if name in SIZES else -reach, reach
+
+    @property
+    def total_ends(self) -> tuple[float, float]:
+        """Ends of the interval of the total [m³], the smaller size first; nan where the run states none."""
+        sign = math.copysign(1.0, self.unit)
+        low, high = true_sizes(sign * (math.nan if self.total is None else self.total), *self.interval("total"))
+        return sign * low, sign * high
+
+    @property
+    def least_dice(self) -> float:
+        """The lower bound of Dice."""
+        return max(0.0, 1 - self.interval("dice")[1])
 
     @property
     def matter(self) -> MatterMap:
@@ -156,10 +169,9 @@ class Rehearsal:
 
     @property
     def doubtful(self) -> bool:
-        """Whether the residual is more than this method leaves, or has a cause that no rehearsal shows."""
-        found = self.explained
-        own = not found.good and found.cause not in [str(run["cause"]) for run in self.runs]
-        return self.excess[0] > self.limit or own
+        """Whether the frames are not explained, or leave more than this method does: rehearsals of wrong metadata have
+        them, too, and may leave as much."""
+        return self.excess[0] > self.limit or not self.explained.good
 
     @property
     def word(self) -> Word:
@@ -200,29 +212,32 @@ class Rehearsal:
 
     def intervals(self) -> list[str]:
         """What the intervals are of, and a line for each quantity."""
-        ends = {name: self.interval(name) for name in (*SIGNED, *SIZES, "resolution")}
+        ends = {name: self.interval(name) for name in (*SIGNED, *SIZES)}
         scenes = min(each.scenes for each in factors().values())
         level = min(LEVEL, scenes / (scenes + 1))  # the largest of few scores stands for their quantile
-        lines = [f"intervals of {level:.0%}, by {len(self.runs)} rehearsals and {scenes} simulated scenes:"]
+        lines = [
+            f"intervals of {level:.0%}, by {len(self.runs)} rehearsals and {scenes} simulated scenes, on pixels of "
+        ]
+        lines[0] += f"{1e6 * self.pixel:.3g} µm:"
         if self.total is not None:
-            low, high = (self.total / (1 + end) if end > -1 else math.inf for end in reversed(ends["total"]))
-            said = f"{low:.3g} to {high:.3g} m³ {self._told('total')}"
-            lines.append(f"total {self.quantity} {self.total:.3g} m³: {said}")
+            low, high = self.total_ends
+            said = f"{low:.3g} m³ or more in size" if math.isinf(high) else f"{low:.3g} to {high:.3g} m³"
+            lines.append(f"total {self.quantity} {self.total:.3g} m³: {said} {self._told('total')}")
         named = [("total", f"total {self.quantity}")] if self.total is None else []
         named += [("delta", f"mean {self.quantity} in the matter"), ("volume", "volume of the matter")]
         for name, said in named:
             low, high = (in_percent(end) for end in (min(1.0, -ends[name][0]), ends[name][1]))
             lines.append(f"{said}: up to {low} too low or {high} too high {self._told(name)}")
         expected = "" if self.found is None else f"; expected by the map of matter: {self.matter.expected_dice:.2f}"
-        lengths = [2e6 * self.pixel * max(1.0, math.exp(end)) for end in ends["resolution"]]
+        widest = math.inf if self.found is None else max(self.found.grid.shape) / 2
+        finest, coarsest = (2e6 * self.pixel * size for size in (1, min(math.exp(ends["resolution"][1]), widest)))
         return [
             *lines,
-            f"Dice: at least {max(0.0, 1 - ends['dice'][1]):.2f} (rehearsals: {1 - self.values('dice').mean():.2f}"
-            f"{expected})",
+            f"Dice: at least {self.least_dice:.2f} (rehearsals: {1 - self.values('dice').mean():.2f}{expected})",
             f"relative error of {self.quantity}: at most {ends['error'][1]:.2f} (rehearsals: "
             f"{self.values('error').mean():.2f})",
             f"centre of mass: within {1e6 * ends['centre'][1] * self.pixel:.2g} µm",
-            f"resolution: {lengths[0]:.3g} to {lengths[1]:.3g} µm (full period, half-bit)",
+            f"resolution: at worst {coarsest:.3g} µm (full period, half-bit; these pixels allow {finest:.3g} µm)",
         ]
 
     def _told(self, name: str) -> str:
@@ -254,15 +269,15 @@ def rehearse(
     done: a run of one time; scan: its frames, as `done.placed` gives them; prior, method, seed: of the run
     bins: pixels joined along an edge (default: to about `SIDE` pixels); of joined pixels the measured frames are
     reconstructed, too
-    causes: whether mistakes in the scan are compared on held-out frames (`certainty`) if the residual is more than the
-    rehearsals leave
+    causes: whether mistakes in the scan are compared on held-out frames (`certainty`) if the frames are not explained
     folder: of the run, whose summary.json keeps each rehearsal, so that a later call makes those that are missing
 
     Frames have noise of the measured ones' power, and their light. They are simulated on a raster of their own, several
     times finer than that of fits, in plain torch; line integrals are those of the result's own representation. All
     views are turned by one random angle about the result, which is as smooth as its own views leave it.
-    Rehearsals take decisions on matter and light, poses and distances for exact. Errors: `InputError` for results in
-    motion, without matter or verdict, and for fewer than 2 rehearsals.
+    What the run found of distance, energy and poses is drawn from its errors; what the scan gave of them, and decisions
+    on matter and light, are taken for exact. Errors: `InputError` for results in motion, without matter or verdict, and
+    for fewer than 2 rehearsals.
 
     Examples:
 
@@ -283,6 +298,7 @@ def rehearse(
         not isinstance(done.object, InMotion) and done.verdict is not None,
         "rehearse takes a run of reconstruct, of matter at one time; this one moves or has no verdict.",
     )
+    method = method.afresh(done.object) if isinstance(method, Continued) else method  # its start knows the truth
     method = method.suited(done.choice.matter) if isinstance(method, Auto) else method
     bins = max(1, min(scan.views.shape) // SIDE) if bins is None else bins
     require(bins >= 1, f"bins must be 1 pixel or more, but it is {bins}.")
@@ -291,7 +307,7 @@ def rehearse(
     grid = Grid.of_views(coarse.views)
     truth = done.object.voxelise(grid)
     require(bool(truth.delta.any()), "a run must have found matter to be rehearsed, but its volume is empty.")
-    kept = None if folder is None else read_rehearsal(folder)
+    kept = None if folder is None else _kept(folder)
     if kept is None or kept.binned != bins or kept.found is None:
         on_progress("measured frames on larger pixels", 0.0)
         judged = done if bins == 1 else again(coarse)
@@ -299,22 +315,24 @@ def rehearse(
         stated, quantity = (None, "δ") if done.total is None else (done.total.value, done.total.quantity)
         told = _told(done, judged.object.voxelise(grid))
         unit = robust_material_delta(_told(done, truth))
-        kept = Rehearsal(bins, coarse.views.finest, judged.verdict, (), unit, told, stated, quantity)
-        if folder is not None:
+        doubts = doubts_of(done, prior)
+        kept = Rehearsal(bins, coarse.views.finest, judged.verdict, (), unit, told, stated, quantity, doubts=doubts)
+        if folder is not None:  # what was there is of another volume
+            folder.write_summary({name: said for name, said in folder.read_summary().items() if name != ENTRY})
             write_volume(folder.path / FOUND, told)
     train = coarse.train()
-    noise, factor = _noise_and_light(done, train)
     while len(kept.runs) < times:
         number = len(kept.runs)
         on_progress(f"rehearsal {number + 1} of {times}", number / times)
-        turned = _turned(train.exposures, np.random.default_rng([seed, number]).uniform(0, 360))
-        quiet = _quiet(done, turned)
-        drawn = quiet * factor + noise.drawn(seed + number).numpy() * np.sqrt(np.clip(quiet, 0, None))
-        found = again(replace(train, exposures=turned, frames=drawn.astype(np.float32)), number + 1)
+        rng = np.random.default_rng([seed, number])
+        turned = turned_by(train.exposures, rng.uniform(0, 360))
+        drawn = drawn_frames(done, train, as_uncertain(done, turned, bins, rng), seed + number)
+        found = again(replace(drawn, exposures=turned), number + 1)
         kept = replace(kept, runs=(*kept.runs, _shown_by(found, truth)))
         _keep(folder, kept)
     if causes and kept.cause is None and kept.doubtful:
-        kept = replace(kept, cause=compare_causes(coarse, again, on_progress))
+        rehearsed = drawn_frames(done, coarse, coarse.exposures, seed)
+        kept = replace(kept, cause=compare_causes(coarse, again, rehearsed, on_progress))
         _keep(folder, kept)
     on_progress("rehearsals", 1.0)
     return kept
@@ -337,7 +355,7 @@ def foresee(
     verdicts, runs = list[Verdict](), list[Mapping[str, Any]]()
     for number in range(times):
         on_progress(f"rehearsal {number + 1} of {times}", number / times)
-        turned = _turned(exposures, np.random.default_rng([0, number]).uniform(0, 360))
+        turned = turned_by(exposures, np.random.default_rng([0, number]).uniform(0, 360))
         scan = simulate(matter, turned, photons_per_pixel=photons, seed=number, is_test=all_train)
         found = reconstruct(scan, prior, method, seed=number)
         assert found.verdict is not None
@@ -360,31 +378,13 @@ def _told(done: Reconstruction, volume: Volume) -> Volume:
     return volume if done.delta_told else of_absorption(volume)
 
 
-def _turned(exposures: Exposures, degrees: float) -> Exposures:
-    """Views turned by `degrees` about the object: about the line along y through what all look at."""
-    views, by = exposures.views, rotation_y([degrees])[0]
-    middle = Grid.of_views(views).centre
-    rotations = views.rotations @ by
-    shifts = views.shifts + ((rotations - views.rotations) @ middle)[:, :2]
-    return replace(exposures, views=replace(views, rotations=rotations, shifts=shifts))
-
-
-def _quiet(done: Reconstruction, exposures: Exposures) -> np.ndarray:
-    """Frames [V, H, W] of a result without light and noise."""
-    with torch.no_grad():
-        return np.stack(list(simulated_frames(done.object, exposures, Simulation())))
-
-
-def _noise_and_light(done: Reconstruction, train: Scan) -> tuple[NoiseModel, np.ndarray]:
-    """Noise and light of the measured training frames at these pixels."""
-    lit = light_of(train, done.light, done.still)
-    if lit is None:
-        return NoiseModel.of_frames(train.measured), np.ones((1, 1, 1))
-    return lit.noise, lit.factor().numpy()
-
-
 def read_rehearsal(folder: RunFolder) -> Rehearsal | None:
-    """The rehearsals in the summary.json of a run; None where none was made."""
+    """The rehearsals in the summary.json of a run; None where fewer than two were made, which have no spread."""
+    kept = _kept(folder)
+    return None if kept is None or len(kept.runs) < FEWEST else kept
+
+
+def _kept(folder: RunFolder) -> Rehearsal | None:
     if not folder.summary.is_file():
         return None
     with as_written(folder.summary, "what rehearse wrote"):
@@ -398,7 +398,7 @@ def read_rehearsal(folder: RunFolder) -> Rehearsal | None:
 def matter_of(folder: RunFolder) -> MatterMap | None:
     """Where rehearsals of a run say that matter is likely; None where none are kept."""
     kept = read_rehearsal(folder)
-    return None if kept is None or kept.found is None or not kept.runs else kept.matter
+    return None if kept is None or kept.found is None else kept.matter
 
 
 def _keep(folder: RunFolder | None, kept: Rehearsal) -> None:

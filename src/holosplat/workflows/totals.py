@@ -14,6 +14,7 @@ from ..checks import InputError
 from ..fit.residuals import Prediction
 from ..frames import evenly
 from ..geometry import Grid
+from ..matter import MaterialPrior
 from ..methods import Task
 from ..methods.modulation import DOUBTFUL, RATIO_SHARE, Total, total_delta
 from ..methods.spherical import ProfileErrors, SphericalFit
@@ -107,7 +108,7 @@ def total_of_run(said: Prediction, frames: Scan, task: Task, constants: tuple[De
     predicted = None if _imaged_as_voxels(said, frames, factor) else _predicted(said, few, chosen).binned(factor)
     noise = _noise(task, frames)[torch.from_numpy(chosen)].binned(factor)
     shown = None if predicted is None else torch.from_numpy(predicted.frames)
-    doubt = _ratio_doubt(task, constants)
+    doubt = ratio_doubt(task.prior, constants)
     total = total_delta(found, few.binned(factor), noise, shown, doubt)
     material = task.prior.materials[0].delta if len(task.prior.materials) == 1 else None
     return TotalMatter(
@@ -119,12 +120,12 @@ def total_of_run(said: Prediction, frames: Scan, task: Task, constants: tuple[De
     )
 
 
-def _ratio_doubt(task: Task, constants: tuple[Determined, ...]) -> float:
+def ratio_doubt(prior: MaterialPrior, constants: tuple[Determined, ...]) -> float:
     """Standard error of δ/β as a share: a quarter of its interval of 95 %."""
     for each in constants:
         if each.name == "delta_beta":
             return min(RATIO_SHARE, 0.25 * abs(math.log(each.high / each.low)))
-    return 0.0 if task.prior.fixes_ratio else RATIO_SHARE
+    return 0.0 if prior.fixes_ratio else RATIO_SHARE
 
 
 def in_words(
