@@ -13,9 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from helpers.strategies import NAMES
-from holosplat.methods import METHODS, Auto
+from holosplat.methods import METHODS
 from holosplat.methods.presets import method_of, preset, preset_names
-from holosplat.tables import changed, from_table, merged, overridden, to_table, with_entries
+from holosplat.tables import changed, from_table, merged, overridden, to_table
 
 FLOATS = st.floats(allow_nan=False, allow_infinity=False)
 
@@ -99,10 +99,3 @@ def test_the_options_of_every_method_come_back_through_json(name):
     table = json.loads(json.dumps(to_table(options)))
     assert from_table(type(options), table) == options
     assert method_of(table) == options
-
-
-def test_entries_go_to_fields_of_their_name_and_type():
-    """`PerView.retrieval` is the name of a retrieval, that of `HolographicTV` a number of steps."""
-    whole = with_entries(Auto(), {"retrieval": 7})
-    assert whole.volume != Auto().volume
-    assert with_entries(METHODS["ctf-tv"], {"retrieval": 7}) == METHODS["ctf-tv"]

@@ -141,13 +141,11 @@ def to_table(value: Any) -> Any:
 
 
 def with_entries(value: Any, entries: Mapping[str, Any]) -> Any:
-    """The dataclass `value` with these values of its fields, and of dataclasses that are its fields, by their names;
-    fields of other types that have such a name stay as they are."""
+    """The dataclass `value` with these values of its fields, and of dataclasses that are its fields, by their names."""
     changes = {}
     for name in _fields(type(value)) if _is_dataclass(value) else ():
         old = getattr(value, name)
-        named = name in entries and type(entries[name]) is type(old)
-        new = entries[name] if named else with_entries(old, entries)
+        new = entries[name] if name in entries else with_entries(old, entries)
         changes |= {} if new is old else {name: new}
     return dataclasses.replace(value, **changes) if changes else value
 
