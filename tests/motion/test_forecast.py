@@ -19,7 +19,7 @@ from holosplat.matter import Matter
 from holosplat.mesh import TriangleMesh, across, normals
 from holosplat.metrics.volumes import normal_distance
 from holosplat.motion.fit import MotionFit
-from holosplat.motion.forecast import PathForecast, extrapolate
+from holosplat.motion.forecast import History, PathForecast, extrapolate
 from holosplat.motion.measures import half_sets
 from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.specimens.red_cells import icosphere
@@ -51,7 +51,7 @@ def missed(found: MovingSurfaces, body: int = 0) -> list[float]:
 
 def test_what_turns_goes_on_turning():
     """A turn is no polynomial of places: paths that are carried on straight swell, parts that turn do not."""
-    found = extrapolate(fitted(), TIMES, AHEAD)
+    found = extrapolate(History(fitted(), TIMES), AHEAD)
     straight = [normal_distance(fitted().bodies(t)[0], truth(0, t)) for t in AHEAD]
     assert missed(found.bodies)[-1] < 0.1 * straight[-1]
     assert missed(found.bodies)[-1] < 0.02e-6
@@ -66,7 +66,7 @@ def test_the_band_is_the_error_of_noise():
     for seed in seeds:
         halves = fitted(0.1e-6, seed + 1), fitted(0.1e-6, seed + 2)
         mean = halves[0].with_parameters({"coefficients": 0.5 * (halves[0].coefficients + halves[1].coefficients)})
-        found = extrapolate(mean, TIMES, AHEAD, PathForecast(), halves)
+        found = extrapolate(History(mean, TIMES, halves), AHEAD)
         assert (np.diff(found.band, axis=0) > 0).all()
         ratios.append([np.square(missed(found.bodies)), np.square(found.band[:, 0])])
     error, band = np.sqrt(np.mean(ratios, axis=0))
@@ -76,13 +76,13 @@ def test_the_band_is_the_error_of_noise():
 def test_a_window_and_a_stiff_body_are_told():
     """Bodies that turned otherwise before the window; and ones whose shape was about to change."""
     bodies = fitted()
-    late = extrapolate(bodies, TIMES, AHEAD, PathForecast(window=6))
+    late = extrapolate(History(bodies, TIMES), AHEAD, PathForecast(window=6))
     assert missed(late.bodies)[-1] < 0.05e-6
     grown = bodies.coefficients.clone()
     grown[-1] = grown[-1] + 0.3 * (grown[-1] - grown[-1].mean(0))
     swelling = bodies.with_parameters({"coefficients": grown})
-    free = extrapolate(swelling, TIMES, AHEAD, PathForecast(keep_volume=False)).bodies
-    stiff = extrapolate(swelling, TIMES, AHEAD, PathForecast(rigid=True, keep_volume=False)).bodies
+    free = extrapolate(History(swelling, TIMES), AHEAD, PathForecast(keep_volume=False)).bodies
+    stiff = extrapolate(History(swelling, TIMES), AHEAD, PathForecast(rigid=True, keep_volume=False)).bodies
     first, last = (np.array([abs(of.bodies(t)[0].volume) for of in (free, stiff)]) for t in (AHEAD[0], AHEAD[-1]))
     assert last[1] == pytest.approx(first[1], rel=0.01)
     assert last[0] > 1.2 * first[0]
@@ -90,9 +90,9 @@ def test_a_window_and_a_stiff_body_are_told():
 
 def test_one_time_ahead_and_too_few_times_behind():
     """A single step is enough; three times tell no error."""
-    found = extrapolate(fitted(), TIMES, AHEAD[:1])
+    found = extrapolate(History(fitted(), TIMES), AHEAD[:1])
     assert missed(found.bodies)[0] < 0.02e-6
-    assert np.isnan(extrapolate(fitted(), TIMES[-3:], AHEAD).band).all()
+    assert np.isnan(extrapolate(History(fitted(), TIMES[-3:]), AHEAD).band).all()
 
 
 def test_distance_along_normals():
@@ -121,8 +121,8 @@ def test_half_sets_are_fits_to_half_of_the_times():
     even, odd = (1e6 * centroid(one.bodies(0.0)[0])[1] for one in halves)
     assert even == pytest.approx(0, abs=0.1)
     assert odd == pytest.approx(1, abs=0.2)
-    with pytest.raises(InputError, match="8 times"):
-        half_sets(scan[:8], still, replace(how))
+    with pytest.raises(InputError, match="frames of 4 times or more"):
+        half_sets(scan[:6], still, replace(how))
     journal, taken = Kept(), list[float]()
 
     def cut_off(record: dict[str, float]) -> None:

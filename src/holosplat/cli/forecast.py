@@ -45,6 +45,12 @@ from .places import Output
 from .progress import ProgressBar
 from .sentence import interruptible, put, say, tell
 
+MECHANICAL = ("auto", "mechanics", "hybrid", "assimilate")
+OF_CHANNEL = ("flow_axis", "channel_centre", "peak", "shear_modulus", "viscosity", "back")
+"""Options of the mechanics, beside the channel."""
+TAKEN = {"weights": ("auto", "graph", "hybrid"), "degree": ("paths", "rigid", *MECHANICAL), "channel": MECHANICAL}
+"""Options that some ways alone take."""
+
 
 @checked_dataclass
 class ForecastFlags:
@@ -78,7 +84,7 @@ class ForecastFlags:
     channel: tuple[Small, Small] | None = None
     """Extents [m] of a rectangular channel across the flow, along the other two axes in the order x, y, z."""
     flow_axis: Literal["x", "y", "z"] = "y"
-    """Along which axis of the object it leads; a flow along the rotation axis is one along y."""
+    """Along which axis of the object it leads, either way; a flow along the rotation axis is one along y."""
     channel_centre: tuple[Signed, Signed, Signed] = (0.0, 0.0, 0.0)
     """A point on its axis (x, y, z) [m]."""
     peak: str | None = None
@@ -89,7 +95,15 @@ class ForecastFlags:
     """Of the fluid in and around cells [Pa s]."""
 
     def options(self) -> ForecastOptions:
-        """The options of the forecast."""
+        """The options of the forecast; `InputError` for ones that this way does not take."""
+        usual = ForecastFlags()
+        for name, ways in TAKEN.items():
+            given = getattr(self, name) != getattr(usual, name)
+            require(self.by in ways or not given, f"--{name} needs --by {', '.join(ways[:-1])} or {ways[-1]}.")
+        for name in OF_CHANNEL:
+            given = getattr(self, name) != getattr(usual, name)
+            require(self.channel is not None or not given, f"--{name.replace('_', '-')} needs --channel.")
+        require(self.half_sets or self.effort == usual.effort, "--effort needs --half-sets.")
         step = 0.0 if self.step is None else positive("--step", self.step, "seconds")
         model = PathForecast(self.degree, self.window, self.by == "rigid", self.keep_volume)
         fit = MotionFit()
@@ -100,7 +114,7 @@ class ForecastFlags:
 
     def _learned(self) -> GraphForecast | DmdForecast | SindyForecast | None:
         if self.by == "dmd" or self.by == "sindy":
-            return (DmdForecast if self.by == "dmd" else SindyForecast)(self.window)
+            return (DmdForecast if self.by == "dmd" else SindyForecast)(self.window, self.keep_volume)
         if self.by in ("graph", "hybrid", "auto"):
             return GraphForecast(self.weights, self.window, self.keep_volume)
         return None
@@ -183,11 +197,11 @@ def _whole_scan(folder: RunFolder) -> Scan:
 
 def _source(folder: RunFolder, scan: Scan, found: Forecasted, out: Path) -> dict[str, object]:
     """What source.json says: the later times of the run's scan, or else the predicted frames."""
-    later = np.flatnonzero(scan.instants > found.forecast.bodies.basis.first)[: len(found.forecast.times)]
-    if not len(later):
+    if not found.judged:
         return run_source(out / FRAMES, Reading())
+    later = np.searchsorted(scan.instants, [found.judged[0]["time_s"], found.judged[-1]["time_s"]])
     own = run_reading(folder.path)
-    part = replace(own.part, time_frame=None, time_frames=f"{later[0]}:{later[-1] + 1}")
+    part = replace(own.part, time_frame=None, time_frames=f"{later[0]}:{later[1] + 1}")
     return run_source(folder.source_scan(), replace(own, part=part))
 
 

@@ -183,7 +183,7 @@ class PathForecast:
 
     def fit(self, history: History) -> Model:
         """The paths as they go on."""
-        return Model(lambda ahead: extrapolate(history.bodies, history.times, ahead, self, history.halves))
+        return Model(lambda ahead: extrapolate(history, ahead, self))
 
 
 @dataclass(frozen=True)
@@ -207,11 +207,23 @@ class Forecast:
 @dataclass(frozen=True)
 class History:
     """What a forecast begins with. bodies: fitted to frames at `times` [T] s; halves: fits to two halves of them, which
-    say how far each part of the motion is believed and how uncertain the forecast is."""
+    say how far each part of the motion is believed and how uncertain the forecast is; early: such fits to the frames of
+    the first two thirds of the times alone, which later frames never changed. Without them bodies count as exact."""
 
     bodies: MovingSurfaces
     times: np.ndarray
     halves: Halves | None = None
+    early: Halves | None = None
+
+    @property
+    def before(self) -> History:
+        """What is known of the first two thirds of the times: forecasts of the others from it can be tested."""
+        times = self.times[: early_count(len(self.times))]
+        if self.early is None:
+            return History(self.bodies, times, self.halves)
+        one, other = self.early
+        mean = one.with_parameters({"coefficients": 0.5 * (one.coefficients + other.coefficients)})
+        return History(mean, times, self.early)
 
     def last(self, count: int) -> np.ndarray:
         """The last `count` times [s] (0: all)."""
@@ -236,18 +248,16 @@ class Forecaster(Protocol):
         ...
 
 
-def extrapolate(
-    bodies: MovingSurfaces,
-    times: np.ndarray,
-    ahead: np.ndarray,
-    options: PathForecast = PathForecast(),
-    halves: Halves | None = None,
-) -> Forecast:
-    """`bodies`, fitted to frames at `times` [T] s, at the later times `ahead` [N] s.
+def early_count(times: int) -> int:
+    """How many of so many times are the first two thirds."""
+    return (2 * times + 2) // 3
 
-    halves: fits to two halves of the frames, which say how far each part of the motion is believed and how uncertain
-    the forecast is. The band is half of what forecasts from the two differ by, and what a forecast of the window's last
-    time from its first two thirds misses beyond that, growing with the square of the time ahead, counted in windows.
+
+def extrapolate(history: History, ahead: np.ndarray, options: PathForecast = PathForecast()) -> Forecast:
+    """The paths of `history` at the later times `ahead` [N] s.
+
+    The band is half of what forecasts from two halves of the frames differ by, and what a forecast of the last time
+    from the first two thirds misses beyond that, growing with the square of the time ahead, counted in windows.
     """
 
     def say(
@@ -255,14 +265,14 @@ def extrapolate(
     ) -> tuple[Places, np.ndarray]:
         return smoothed(of, window, later, replace(options, window=0), both)
 
-    return told_by(say, bodies, options.times(times), ahead, halves, options.degree)
+    return told_by(say, history, options.times, ahead, options.degree)
 
 
 def decided(history: History, paths: PathForecast, others: Sequence[Forecaster]) -> Decision:
     """Whether bodies go on as `paths` or as another way says, from simple to complex: which tells the last third of the
     times better from those before. Bodies are the blocks of the score; ways that cannot be asked are left out."""
-    early, late = np.split(history.times, [(2 * len(history.times) + 2) // 3])
-    before = History(history.bodies, early, history.halves)
+    before = history.before
+    late = history.times[len(before.times) :]
     truth = places_of(history.bodies, late)
     scores, by = dict[str, Score](), "the last third of the run's times"
     for way in (paths, *others):
@@ -284,21 +294,25 @@ Say = Callable[[MovingSurfaces, np.ndarray, np.ndarray, "Halves | None"], "tuple
 
 
 def told_by(
-    say: Say, bodies: MovingSurfaces, window: np.ndarray, ahead: np.ndarray, halves: Halves | None, degree: int
+    say: Say, history: History, windowed: Callable[[np.ndarray], np.ndarray], ahead: np.ndarray, degree: int
 ) -> Forecast:
-    """The forecast of `say` with the band of `extrapolate`; degree: times of which no forecast can be tested."""
+    """The forecast of `say` with the band of `extrapolate`; windowed: which of some times it sees; degree: times of
+    which no forecast can be tested."""
+    window, bodies = windowed(history.times), history.bodies
     last = window[-1]
-    places, spread = say(bodies, window, np.r_[last, ahead], halves)
-    missed, horizon = _backtest(say, bodies, window, halves, degree)
+    places, spread = say(bodies, window, np.r_[last, ahead], history.halves)
+    missed, horizon = _backtest(say, history, windowed, degree)
     growth = ((ahead - last) / (last - window[0]) / horizon) ** 2
     band = np.hypot(spread[1:], growth[:, None] * missed)
     return Forecast(on_paths(bodies, np.r_[last, ahead], places), ahead, band)
 
 
-def on_paths(bodies: MovingSurfaces, times: np.ndarray, places: Places) -> MovingSurfaces:
-    """The same bodies on paths through `places` at `times` [N + 1], two at least."""
+def on_paths(
+    bodies: MovingSurfaces, times: np.ndarray, places: Places, basis: TimeBasis | None = None
+) -> MovingSurfaces:
+    """The same bodies on paths through `places` at `times` [N + 1], two at least; near them on a given `basis`."""
     degree = min(SMOOTH, len(times) - 1)
-    basis = TimeBasis(float(times[0]), float(times[-1]), degree, len(times) - degree)
+    basis = basis or TimeBasis(float(times[0]), float(times[-1]), degree, len(times) - degree)
     paths = [basis.fitted(times, one) for one in places]
     faces = [bodies.body(k)[1].numpy() for k in range(bodies.count)]
     found = MovingSurfaces.of_bodies(paths, faces, basis, bodies.unit_length, bodies.matter)
@@ -366,18 +380,29 @@ def of_volume(vertices: np.ndarray, faces: np.ndarray, volume: float) -> np.ndar
     return middle + share ** (1 / 3) * (vertices - middle) if share > 0 else vertices
 
 
+def of_kept_volume(bodies: MovingSurfaces, times: np.ndarray, places: Places) -> Places:
+    """`places` of each body, such that it has its mean volume at `times`."""
+    found = []
+    for k, (before, later) in enumerate(zip(places_of(bodies, times), places)):
+        faces = bodies.body(k)[1].numpy()
+        usual = float(np.mean([TriangleMesh(one, faces).volume for one in before]))
+        found.append(np.array([of_volume(one, faces, usual) for one in later]))
+    return found
+
+
 def _backtest(
-    say: Say, bodies: MovingSurfaces, times: np.ndarray, halves: Halves | None, degree: int
+    say: Say, history: History, windowed: Callable[[np.ndarray], np.ndarray], degree: int
 ) -> tuple[np.ndarray, float]:
     """Error of a forecast of the last time from the first two thirds for each body [B] m beyond its noise, together
     with the median of all, and how far ahead it looked, in its own windows; NaN for fewer times than it needs."""
-    early = times[: (2 * len(times) + 2) // 3]
-    if len(early) <= degree or len(early) == len(times):
+    before, bodies, last = history.before, history.bodies, history.times[-1:]
+    early = windowed(before.times)
+    if len(early) <= degree or len(before.times) == len(history.times):
         return np.full(bodies.count, np.nan), 1.0
-    said, spread = say(bodies, early, times[-1:], halves)
+    said, spread = say(before.bodies, early, last, before.halves)
     squares = np.zeros(bodies.count)
-    for k, (one, other) in enumerate(zip(said, places_of(bodies, times[-1:]))):
+    for k, (one, other) in enumerate(zip(said, places_of(bodies, last))):
         missed = across(one, other, bodies.body(k)[1].numpy())[0]
         squares[k] = max(float(missed**2 - spread[0, k] ** 2), 0.0)
-    horizon = float((times[-1] - early[-1]) / (early[-1] - early[0]))
+    horizon = float((last[0] - early[-1]) / (early[-1] - early[0]))
     return np.sqrt(0.5 * (squares + np.median(squares))), horizon
