@@ -12,6 +12,7 @@ import pytest
 import holosplat as hs
 import holosplat.cli.forecast as acting
 import holosplat.cli.track as command
+import holosplat.workflows.forecast as forecasts
 import holosplat.workflows.track as workflow
 from helpers.cli import Outcome, holosplat, refused, worked
 from helpers.moving_ellipsoids import MATERIAL, PIXEL, STEP, ellipsoid, scan
@@ -20,6 +21,7 @@ from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.io.objects import read_object
 from holosplat.io.paraview import read_pvd
 from holosplat.matter import Matter
+from holosplat.motion.measures import half_sets
 from holosplat.motion.track import Followed
 from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.specimens.red_cells import icosphere
@@ -53,9 +55,39 @@ def folder(tmp_path_factory) -> Path:
         patch.setattr(command, "report_run", lambda folder, *_: folder.report)  # a second one says no more
         how = ("--material", "haemoglobin", "--time-frames", f"1:{TIMES - 1}")
         worked_by("track", folder / "scan.nxs", *how, "--out", folder / "run")
-    with undrawn():
+    with undrawn(), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(forecasts, "half_sets", seen_by_halves)
         worked_by("forecast", folder / "run", "--times", AHEAD, *SHORT, "--out", folder / "later")
     return folder
+
+
+SEEN = list[np.ndarray]()
+"""Times of the frames of each pair of halves."""
+
+
+def seen_by_halves(train: hs.Scan, *others: object, **named: object) -> object:
+    SEEN.append(train.instants)
+    return half_sets(train, *others, **named)  # type: ignore[arg-type]
+
+
+def test_halves_are_of_the_run_and_of_its_first_two_thirds(folder):
+    """Times of the scan before those of the run are not in them."""
+    whole, early = SEEN
+    assert whole == pytest.approx(STEP * np.arange(1, TIMES - 1))
+    assert early == pytest.approx(whole[:6])
+
+
+def test_without_half_sets_nothing_is_said_of_errors(folder):
+    """The scan's later frames that the run judges are those within the forecast."""
+    out = folder / "alone"
+    with undrawn():
+        said = worked_by("forecast", folder / "run", "--no-half-sets", "--times", 2, "--step", STEP / 2, "--out", out)
+    assert "standard error of surfaces: not told" in said.out
+    assert "nothing else was asked, for that needs half-sets" in said.out
+    with (out / "forecast.csv").open() as file:
+        assert {row["standard_error_m"] for row in csv.DictReader(file)} == {"nan"}
+    assert json.loads((out / "source.json").read_text())["reading"]["time_frames"] == f"{TIMES - 1}:{TIMES}"
+    assert json.loads((out / "config.json").read_text())["method"]["forecast"] == "auto"
 
 
 def test_only_the_first_times_are_tracked(folder):

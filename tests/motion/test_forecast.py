@@ -19,8 +19,8 @@ from holosplat.matter import Matter
 from holosplat.mesh import TriangleMesh, across, normals
 from holosplat.metrics.volumes import normal_distance
 from holosplat.motion.fit import MotionFit
-from holosplat.motion.forecast import History, PathForecast, extrapolate
-from holosplat.motion.measures import half_sets
+from holosplat.motion.forecast import History, PathForecast, early_count, extrapolate, places_of
+from holosplat.motion.measures import early_part, half_sets
 from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.specimens.red_cells import icosphere
 
@@ -71,6 +71,46 @@ def test_the_band_is_the_error_of_noise():
         ratios.append([np.square(missed(found.bodies)), np.square(found.band[:, 0])])
     error, band = np.sqrt(np.mean(ratios, axis=0))
     assert band / error == pytest.approx(1, abs=0.5)
+
+
+def risen(times: np.ndarray) -> list[np.ndarray]:
+    """Two balls whose middles rise as the cube of time, by 2 µm at the last of `TIMES`."""
+    rise = 2e-6 * (times / TIMES[-1])[:, None, None] ** 3 * [0.0, 0.0, 1.0]
+    return [2e-6 * SPHERE + [9e-6 * body, 0, 0] + rise for body in range(2)]
+
+
+def on_parabolas(times: np.ndarray) -> MovingSurfaces:
+    """What a fit to frames of these times alone finds."""
+    basis = TimeBasis(times[0], times[-1], 2)
+    paths = [basis.fitted(times, one) for one in risen(times)]
+    return MovingSurfaces.of_bodies(paths, [FACES, FACES], basis, 0.5e-6, Matter.one(1e-7, 0.0))
+
+
+def test_a_forecast_is_tested_by_times_that_it_never_saw():
+    """A parabola through all times goes on from its first two thirds without a miss, and says nothing of the error."""
+    whole, early, halves = on_parabolas(TIMES), on_parabolas(TIMES[: early_count(len(TIMES))]), on_parabolas(TIMES)
+    fooled, told = History(whole, TIMES, (halves, halves)), History(whole, TIMES, (halves, halves), (early, early))
+    off = np.abs(risen(AHEAD)[0] - places_of(extrapolate(told, AHEAD).bodies, AHEAD)[0]).max((1, 2))[-1]
+    bands = [extrapolate(one, AHEAD).band[-1, 0] for one in (fooled, told)]
+    assert bands[0] < 0.01 * off
+    assert 0.1 * off < bands[1] < off
+    truth_of = risen(TIMES[-1:])[0] - places_of(extrapolate(told.before, TIMES[-1:]).bodies, TIMES[-1:])[0]
+    assert np.abs(truth_of).max() > 0.3e-6
+    assert told.before.halves == (early, early)
+
+
+def test_frames_of_the_first_two_thirds_tell_what_was_known_before():
+    """Paths end with them, have no more coefficients than half of them tell, and pass where the bodies were."""
+    bodies = MovingSurfaces.of_bodies(
+        [np.stack([2e-6 * SPHERE] * 5)], [FACES], TimeBasis(0.0, TIMES[-1], 3, 2), 1e-6, Matter.one(1e-7, 0.0)
+    )
+    views = hs.Views.from_angles(np.array([0.0, 90.0]), (15, 22), 1e-6)
+    exposures = hs.Exposures.of(views, 20.0, 0.05).repeated(TIMES)
+    scan = hs.Scan(np.ones((24, 15, 22), dtype=np.float32), exposures, np.zeros(24, dtype=bool))
+    kept, start = early_part(scan, bodies, TIMES)
+    assert kept.tolist() == list(range(16))
+    assert start.basis == TimeBasis(0.0, TIMES[7], 3, 1)
+    assert start.bodies(TIMES[3])[0].vertices == pytest.approx(2e-6 * SPHERE, abs=1e-12)
 
 
 def test_a_window_and_a_stiff_body_are_told():

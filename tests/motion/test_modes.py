@@ -84,3 +84,10 @@ def test_what_is_missing_is_said(monkeypatch):
     monkeypatch.setattr(importlib, "import_module", gone)
     with pytest.raises(MissingError, match=r"needs pydmd: pip install 'holosplat\[dynamics\]'"):
         DmdForecast().fit(History(bodies(), TIMES))
+
+
+def test_bodies_keep_their_volume():
+    pytest.importorskip("pydmd")
+    found = DmdForecast().fit(History(bodies(), TIMES)).ahead(AHEAD).bodies
+    usual = np.mean([bodies().bodies(t)[0].volume for t in TIMES])
+    assert [found.bodies(t)[0].volume for t in AHEAD] == pytest.approx([usual] * 3, rel=1e-6, abs=0)
