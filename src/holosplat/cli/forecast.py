@@ -76,7 +76,7 @@ class ForecastFlags:
     """Whether paths are fitted again to two halves of the times, which say what is believed, and the error."""
     keep_volume: bool = True
     """Whether bodies keep their volume."""
-    effort: float = 1.0
+    effort: Positive = 1.0
     """Factor of the numbers of steps of these fits."""
 
     back: Many = 8
@@ -106,11 +106,10 @@ class ForecastFlags:
         require(self.half_sets or self.effort == usual.effort, "--effort needs --half-sets.")
         step = 0.0 if self.step is None else positive("--step", self.step, "seconds")
         model = PathForecast(self.degree, self.window, self.by == "rigid", self.keep_volume)
-        fit = MotionFit()
-        steps = max(1, round(positive("--effort", self.effort) * fit.schedule.steps))
-        fit = replace(fit, schedule=replace(fit.schedule, steps=steps))
         learned, decides = self._learned(), self.by == "auto"
-        return ForecastOptions(self.times, step, model, self._dynamics(model), learned, decides, self.half_sets, fit)
+        return ForecastOptions(
+            self.times, step, model, self._dynamics(model), learned, decides, self.half_sets, self.effort
+        )
 
     def _learned(self) -> GraphForecast | DmdForecast | SindyForecast | None:
         if self.by == "dmd" or self.by == "sindy":
@@ -170,7 +169,7 @@ def forecast(
     require_cells(tracked, times, options)
     scan = _whole_scan(folder)
     known = scan.exposures[scan.exposures.time <= times[-1]]
-    tell("the forecast", of_forecast(known, options.fit.schedule.views_per_step), out)
+    tell("the forecast", of_forecast(known, MotionFit().schedule.views_per_step), out)
     config = config_of(options, scan, folder.read_config(), seed)
     with claimed(new):
         if not goes_on(new, config, resume):

@@ -22,7 +22,7 @@ from ..optics.background import Light
 from ..representations import MovingSurfaces, TimeBasis
 from ..scan import Exposures, Scan
 from .elastic import Rest
-from .fit import MotionFit, motion_fit
+from .fit import MotionFit, converged, motion_fit
 from .forecast import Halves, early_count, on_paths, places_of
 
 
@@ -194,14 +194,16 @@ def _table(bodies: MovingSurfaces, scan: Scan) -> dict[str, np.ndarray]:
     return {name: np.array([getattr(row, name) for row in rows]).reshape(times, -1) for name in columns()}
 
 
-USUAL = MotionFit()
-"""The usual options of fits to halves."""
+def half_fit(rest: Rest | None) -> MotionFit:
+    """The usual fit to a half: to its end. Of a known shape at rest it is short, for else halves agree on what both
+    have from that."""
+    return converged() if rest is None else MotionFit()
 
 
 def half_sets(
     train: Scan,
     bodies: MovingSurfaces,
-    how: MotionFit = USUAL,
+    how: MotionFit | None = None,
     seed: int = 0,
     light: Light | None = None,
     *,
@@ -213,9 +215,9 @@ def half_sets(
 
     Times before and after determine a path, so that each half gives nearly the path of the whole, with independent
     noise. If views are too few for shapes, the halves begin with perturbed shapes, as those of standard errors do
-    (`astray`), but at the same middles. light: of the frames, which were divided by it; rest: the known shape of
-    the bodies; run: keeps both fits, and goes on with them. Errors: `InputError` for fewer times than tell the paths of
-    halves.
+    (`astray`), but at the same middles. how: as `half_fit` by default; light: of the frames, which were divided by it;
+    rest: the known shape of the bodies; run: keeps both fits, and goes on with them. Errors: `InputError` for fewer
+    times than tell the paths of halves.
     """
     times = train.instants
     require(
@@ -229,7 +231,7 @@ def half_sets(
         kept = np.flatnonzero(number % 2 == half)
         part = None if light is None else light.part(torch.from_numpy(kept))
         start = bodies if tell_shapes(train) else _shapes_astray(bodies, seed, 1 - 2 * half)
-        fit = motion_fit(train[kept], start, how, seed, part, rest)
+        fit = motion_fit(train[kept], start, how or half_fit(rest), seed, part, rest)
         kept_half = run.part(f"half-set {half}")
         kept_half.fit("half-sets", fit, on_record)
         kept_half.keep()

@@ -19,14 +19,13 @@ from ..methods.presets import SCHEMA
 from ..metrics import image_scores, intensity_range
 from ..motion.assimilate import carry_by_frames
 from ..motion.dynamics import DynamicsForecast, HybridForecast, window_of
-from ..motion.fit import MotionFit
 from ..motion.forecast import Forecast, Forecaster, Halves, History, PathForecast, decided
 from ..motion.learned import GraphForecast, read_dynamics
-from ..motion.measures import early_part, half_sets
+from ..motion.measures import early_part, half_fit, half_sets
 from ..motion.modes import DmdForecast, SindyForecast
 from ..optics.background import Light
 from ..progress import FitProgress
-from ..ranges import Many, Seconds, checked_dataclass
+from ..ranges import Many, Positive, Seconds, checked_dataclass
 from ..representations import MovingSurfaces
 from ..scan import Scan
 from ..tables import read_rows, to_table
@@ -66,8 +65,8 @@ class ForecastOptions:
     """Whether paths, what was learnt and the mean compete, by the last third of the run's times."""
     half_sets: bool = True
     """Whether paths are fitted again to two halves of the times, which say what is believed of the motion."""
-    fit: MotionFit = field(default_factory=MotionFit)
-    """These fits."""
+    effort: Positive = 1.0
+    """Factor of the numbers of steps of these fits."""
 
     def __post_init__(self) -> None:
         require(
@@ -285,14 +284,15 @@ def _history(
     bodies, (train, part) = tracked_bodies(run), _evened(run, known)
     if not options.half_sets or len(train.instants) < 2 * bodies.basis.count:
         return History(bodies, times)
-    steps, before = options.fit.schedule.steps, [0.0, 0.0]
+    fit, before = half_fit(run.rest), [0.0, 0.0]
+    fit = replace(fit, schedule=fit.schedule.with_effort(options.effort))
 
     def show(record: dict[str, float]) -> None:
         before[0], before[1] = before[0] + (record["step"] < before[1]), record["step"]
-        on_progress("half-sets", 0.25 * (before[0] + record["step"] / steps), record)
+        on_progress("half-sets", 0.25 * (before[0] + record["step"] / fit.schedule.steps), record)
 
     def halves(scan: Scan, start: MovingSurfaces, light: Light | None, own: Run) -> Halves:
-        return half_sets(scan, start, options.fit, seed, light, rest=run.rest, run=own, on_record=show)
+        return half_sets(scan, start, fit, seed, light, rest=run.rest, run=own, on_record=show)
 
     whole = halves(train, bodies, part, kept)
     early, start = early_part(train, bodies, times)
