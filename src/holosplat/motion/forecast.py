@@ -256,8 +256,9 @@ def early_count(times: int) -> int:
 def extrapolate(history: History, ahead: np.ndarray, options: PathForecast = PathForecast()) -> Forecast:
     """The paths of `history` at the later times `ahead` [N] s.
 
-    The band is half of what forecasts from two halves of the frames differ by, and what a forecast of the last time
-    from the first two thirds misses beyond that, growing with the square of the time ahead, counted in windows.
+    The band is half of what forecasts from two halves of the frames differ by, what the model leaves of the last time
+    beyond its noise, and what a forecast of this from the first two thirds of the times misses beyond its noise, which
+    grows with the square of the time ahead.
     """
 
     def say(
@@ -301,9 +302,12 @@ def told_by(
     window, bodies = windowed(history.times), history.bodies
     last = window[-1]
     places, spread = say(bodies, window, np.r_[last, ahead], history.halves)
-    missed, horizon = _backtest(say, history, windowed, degree)
-    growth = ((ahead - last) / (last - window[0]) / horizon) ** 2
-    band = np.hypot(spread[1:], growth[:, None] * missed)
+    seen = np.zeros(bodies.count)
+    if history.halves is not None:
+        (seen,) = half_apart(bodies, *(places_of(half, window[-1:]) for half in history.halves))
+    left = _beyond(history, places, np.sqrt(np.maximum(seen**2 - spread[0] ** 2, 0)))
+    missed, tested = _backtest(say, history, windowed, degree, seen)
+    band = np.sqrt(spread[1:] ** 2 + left + ((ahead - last) / tested)[:, None] ** 4 * missed)
     return Forecast(on_paths(bodies, np.r_[last, ahead], places), ahead, band)
 
 
@@ -329,9 +333,11 @@ def places_of(bodies: MovingSurfaces, times: np.ndarray) -> Places:
 
 
 def half_apart(bodies: MovingSurfaces, one: Places, other: Places) -> np.ndarray:
-    """[T, B] m: half of what two places of each of the `bodies` differ by along its normals, their standard error."""
+    """[T, B] m: the standard error of each of the `bodies` along its normals, half of what two of its places differ by,
+    squared in equal parts that of the body and the mean of all: one difference tells little."""
     faces = (bodies.body(k)[1].numpy() for k in range(bodies.count))
-    return 0.5 * np.stack([across(a, b, f) for a, b, f in zip(one, other, faces)], axis=1)
+    squares = 0.25 * np.stack([across(a, b, f) for a, b, f in zip(one, other, faces)], axis=1) ** 2
+    return np.sqrt(0.5 * (squares + squares.mean(1, keepdims=True)))
 
 
 def smoothed(
@@ -391,18 +397,24 @@ def of_kept_volume(bodies: MovingSurfaces, times: np.ndarray, places: Places) ->
 
 
 def _backtest(
-    say: Say, history: History, windowed: Callable[[np.ndarray], np.ndarray], degree: int
+    say: Say, history: History, windowed: Callable[[np.ndarray], np.ndarray], degree: int, seen: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Error of a forecast of the last time from the first two thirds for each body [B] m beyond its noise, together
-    with the median of all, and how far ahead it looked, in its own windows; NaN for fewer times than it needs."""
-    before, bodies, last = history.before, history.bodies, history.times[-1:]
+    """Squared error [B] m² of a forecast of the last time from the first two thirds, as of `_beyond`, and how long
+    ahead that is [s]; NaN for fewer times than it needs. seen: [B] m, standard error of the bodies at the last time."""
+    before, last = history.before, history.times[-1:]
     early = windowed(before.times)
     if len(early) <= degree or len(before.times) == len(history.times):
-        return np.full(bodies.count, np.nan), 1.0
+        return np.full(history.bodies.count, np.nan), 1.0
     said, spread = say(before.bodies, early, last, before.halves)
-    squares = np.zeros(bodies.count)
-    for k, (one, other) in enumerate(zip(said, places_of(bodies, last))):
-        missed = across(one, other, bodies.body(k)[1].numpy())[0]
-        squares[k] = max(float(missed**2 - spread[0, k] ** 2), 0.0)
-    horizon = float((last[0] - early[-1]) / (early[-1] - early[0]))
-    return np.sqrt(0.5 * (squares + np.median(squares))), horizon
+    return _beyond(history, said, np.hypot(spread[0], seen)), float(last[0] - early[-1])
+
+
+def _beyond(history: History, said: Places, noise: np.ndarray) -> np.ndarray:
+    """[B] m²: the squared distance of the first places that are `said` from the bodies at the last time, in equal parts
+    of the body and the median of all; of it the share that the median is beyond that of the `noise` [B] m, squared."""
+    pairs = enumerate(zip(said, places_of(history.bodies, history.times[-1:])))
+    faces = history.bodies.body
+    away = np.array([across(one[:1], true, faces(k)[1].numpy())[0] for k, (one, true) in pairs]) ** 2
+    usual = np.median(away)
+    share = max(1 - np.median(noise**2) / max(usual, np.finfo(float).tiny), 0.0)
+    return 0.5 * share * (away + usual)
