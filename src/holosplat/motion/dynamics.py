@@ -30,6 +30,7 @@ from .forecast import (
     PathForecast,
     extrapolate,
     half_apart,
+    left_of,
     of_volume,
     on_paths,
     places_of,
@@ -138,6 +139,7 @@ def window_of(history: History, ahead: np.ndarray, options: DynamicsForecast) ->
     known = options.paths.times(times)
     past = known[-1 - min(options.back, max(1, len(known) // 3)) :]
     seen, spread = smoothed(bodies, known, past, options.paths, halves)
+    spread = np.hypot(spread, np.sqrt(left_of(history, [one[-1:] for one in seen], spread[-1])))
     base = extrapolate(history, ahead, options.paths)
     faces = [bodies.body(k)[1].numpy() for k in range(bodies.count)]
     cells = whole_cells([TriangleMesh(one[-1], f) for one, f in zip(seen, faces)], options.frame)
