@@ -25,6 +25,8 @@ from holosplat.motion.measures import half_sets
 from holosplat.motion.track import Followed
 from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.specimens.red_cells import icosphere
+from holosplat.workflows.forecast import read_band
+from holosplat.workflows.run_folder import RunFolder
 
 AHEAD, TIMES = 2, 10
 """Of the times of the scan the first is before the run, and the last after it."""
@@ -81,11 +83,14 @@ def test_without_half_sets_nothing_is_said_of_errors(folder):
     """The scan's later frames that the run judges are those within the forecast."""
     out = folder / "alone"
     with undrawn():
-        said = worked_by("forecast", folder / "run", "--no-half-sets", "--times", 2, "--step", STEP / 2, "--out", out)
+        said = worked_by(
+            "forecast", folder / "run", "--no-half-sets", "--times", 2, "--step", 0.512345678901 * STEP, "--out", out
+        )
     assert "standard error of surfaces: not told" in said.out
     assert "nothing else was asked, for that needs half-sets" in said.out
-    with (out / "forecast.csv").open() as file:
-        assert {row["standard_error_m"] for row in csv.DictReader(file)} == {"nan"}
+    times, band = read_band(RunFolder(out))
+    assert np.isnan(band).all()
+    assert times == pytest.approx(json.loads((out / "forecast.json").read_text())["times_s"], rel=1e-12, abs=0)
     assert json.loads((out / "source.json").read_text())["reading"]["time_frames"] == f"{TIMES - 1}:{TIMES}"
     assert json.loads((out / "config.json").read_text())["method"]["forecast"] == "auto"
 

@@ -26,6 +26,7 @@ from ..specimens.flow.suspension import PLASMA_VISCOSITY
 from ..workflows.evaluate import evaluate
 from ..workflows.forecast import (
     FRAMES,
+    SAME_TIME,
     TABLE,
     Forecasted,
     ForecastOptions,
@@ -207,5 +208,6 @@ def _source(folder: RunFolder, scan: Scan, found: Forecasted, out: Path) -> dict
 def _shown(scan: Scan, found: Forecasted) -> Scan:
     """What the report shows of the last time: frames that the run did not see, or else those that are predicted."""
     last = found.forecast.times[-1]
-    held_out = scan[np.flatnonzero(np.isclose(scan.exposures.time, last, rtol=1e-6, atol=0))]
+    slack = SAME_TIME * (last - found.forecast.bodies.basis.first)
+    held_out = scan[np.flatnonzero(np.abs(scan.exposures.time - last) <= slack)]
     return held_out if len(held_out) else found.predicted[np.flatnonzero(found.predicted.exposures.time == last)]

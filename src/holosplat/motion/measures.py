@@ -111,7 +111,9 @@ def angular_velocity(mesh: TriangleMesh, speed: np.ndarray) -> np.ndarray:
 
 def _in_field(points: np.ndarray, view: Views) -> np.ndarray:
     """Whether points [P, 3] [m] are on the detector of one view, [P] bool."""
-    seen = points @ view.rotations[0, :2].T - view.shifts[0]
+    lab = points @ view.rotations[0].T
+    wider = 1.0 if view.sources is None else view.sources[0] / (view.sources[0] + lab[:, 2:])
+    seen = wider * lab[:, :2] - view.shifts[0]
     rows, columns = view.shape
     return (np.abs(seen) <= 0.5 * np.array([columns, rows]) * view.pixel_sizes[0]).all(1)
 

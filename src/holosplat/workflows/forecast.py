@@ -223,7 +223,7 @@ def write_forecast(folder: RunFolder, run: Reconstruction, found: Forecasted) ->
     told = {"steps": 0, "times_s": said.times.tolist(), "bodies": said.bodies.count}
     folder.write_summary(summary_of(done, None, found.predicted) | told)
     write_scan(folder.path / FRAMES, found.predicted)
-    errors = ([f"{t:.7g}", k, f"{e:.4g}"] for t, band in zip(said.times, said.band) for k, e in enumerate(band))
+    errors = ([f"{t:.15g}", k, f"{e:.4g}"] for t, band in zip(said.times, said.band) for k, e in enumerate(band))
     write_rows(folder.path / TABLE, ["time_s", "body", "standard_error_m"], errors)
     band = [None if np.isnan(one) else float(one) for one in said.usual_band()]
     write_json(
