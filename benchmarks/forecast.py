@@ -251,7 +251,8 @@ def rows_of(
     scan = imaged(cells, ANGLES[case], seed)
     kept = scan[np.flatnonzero(scan.exposures.time <= cells.times[times - 1])]
     if true:
-        named, bodies, halves, early = "true", truly(cells, times), None, (truly(cells, early_count(times)),) * 2
+        named, bodies, halves, before = "true", truly(cells, times), None, truly(cells, early_count(times))
+        early = before, before
     else:
         named, early, (bodies, halves) = case, None, tracked(kept, seed, keep, f"{case}_{first}_{times}_{seed}")
     pairs, last = followed(bodies, cells, times - 1), times - 1

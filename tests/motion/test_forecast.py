@@ -70,7 +70,7 @@ def test_the_band_is_the_error_of_noise():
         mean = halves[0].with_parameters({"coefficients": 0.5 * (halves[0].coefficients + halves[1].coefficients)})
         found = extrapolate(History(mean, TIMES, halves, early), AHEAD)
         ratios += [[np.square(missed(found.bodies, k)), np.square(found.band[:, k])] for k in range(2)]
-    error, band = np.sqrt(np.moveaxis(ratios, 1, 0))
+    error, band = np.sqrt(np.array(ratios)).transpose(1, 0, 2)
     assert (np.diff(np.median(band, axis=0)) > 0).all()
     assert np.median(band, axis=0) / np.sqrt(np.mean(error**2, axis=0)) == pytest.approx(1, abs=0.5)
     assert ((error < 1.645 * band).mean(0) > 0.75).all()

@@ -84,7 +84,7 @@ class History:
 
     @property
     def before(self) -> History:
-        """What is known of the first two thirds of the times: forecasts of the others from it can be tested."""
+        """The history that ends with the first two thirds of the times, from which forecasts are tested."""
         times = self.times[: early_count(len(self.times))]
         if self.early is None:
             return History(self.bodies, times, self.halves)
