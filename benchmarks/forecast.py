@@ -41,7 +41,7 @@ from holosplat.metrics.volumes import normal_distance
 from holosplat.motion.cell_model import ChannelFrame
 from holosplat.motion.dynamics import DynamicsForecast, HybridForecast
 from holosplat.motion.elastic import Rest
-from holosplat.motion.forecast import Forecaster, Halves, History, PathForecast
+from holosplat.motion.forecast import Forecaster, Halves, History, PathForecast, early_count
 from holosplat.motion.learned import GraphForecast
 from holosplat.motion.measures import half_sets
 from holosplat.motion.modes import DmdForecast, SindyForecast
@@ -251,15 +251,16 @@ def rows_of(
     scan = imaged(cells, ANGLES[case], seed)
     kept = scan[np.flatnonzero(scan.exposures.time <= cells.times[times - 1])]
     if true:
-        named, bodies, halves = "true", truly(cells, times), None
+        named, bodies, halves, before = "true", truly(cells, times), None, truly(cells, early_count(times))
+        early = before, before
     else:
-        named, (bodies, halves) = case, tracked(kept, seed, keep, f"{case}_{first}_{times}_{seed}")
+        named, early, (bodies, halves) = case, None, tracked(kept, seed, keep, f"{case}_{first}_{times}_{seed}")
     pairs, last = followed(bodies, cells, times - 1), times - 1
     exposures = hs.Exposures.of(hs.Views.from_angles(np.array(ANGLES[case]), SHAPE, PIXEL), 20.0, 0.1)
     frames = {h: hs.simulate(cells, exposures.repeated(cells.times[[last + h]])) for h in AHEAD}
     judge = Judge(cells, pairs, frames, intensity_range(kept.frames), last)
     ahead = cells.times[[last + h for h in AHEAD]]
-    history = History(bodies, cells.times[:times], halves)
+    history = History(bodies, cells.times[:times], halves, early)
     yield from rows_by(judge.scores, history, ahead, FRAME, only, [k for _, k in pairs], (named, first, times, seed))
 
 

@@ -12,19 +12,25 @@ import pytest
 import holosplat as hs
 import holosplat.cli.forecast as acting
 import holosplat.cli.track as command
+import holosplat.workflows.forecast as forecasts
 import holosplat.workflows.track as workflow
 from helpers.cli import Outcome, holosplat, refused, worked
-from helpers.moving_ellipsoids import MATERIAL, PIXEL, STEP, TIMES, ellipsoid, scan
+from helpers.moving_ellipsoids import MATERIAL, PIXEL, STEP, ellipsoid, scan
 from helpers.pictures import undrawn
 from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.io.objects import read_object
 from holosplat.io.paraview import read_pvd
 from holosplat.matter import Matter
+from holosplat.motion.measures import half_sets
 from holosplat.motion.track import Followed
 from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.specimens.red_cells import icosphere
+from holosplat.workflows.forecast import read_band
+from holosplat.workflows.run_folder import RunFolder
 
-AHEAD = 2
+AHEAD, TIMES = 2, 10
+"""Of the times of the scan the first is before the run, and the last after it."""
+SHORT = ("--effort", 0.1)
 
 
 def worked_by(*arguments: object) -> Outcome:
@@ -45,20 +51,53 @@ def on_true_paths(train: hs.Scan, *_: object, **__: object) -> Followed:
 def folder(tmp_path_factory) -> Path:
     """The scan, a run of all times but the last, and its forecast of that and one more."""
     folder = tmp_path_factory.mktemp("forecast")
-    write_scan(folder / "scan.nxs", scan())
+    write_scan(folder / "scan.nxs", scan(times=TIMES))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(workflow, "follow", on_true_paths)
         patch.setattr(command, "report_run", lambda folder, *_: folder.report)  # a second one says no more
-        how = ("--material", "haemoglobin", "--time-frames", f"0:{TIMES - 1}")
+        how = ("--material", "haemoglobin", "--time-frames", f"1:{TIMES - 1}")
         worked_by("track", folder / "scan.nxs", *how, "--out", folder / "run")
-    with undrawn():
-        worked_by("forecast", folder / "run", "--times", AHEAD, "--out", folder / "later")
+    with undrawn(), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(forecasts, "half_sets", seen_by_halves)
+        worked_by("forecast", folder / "run", "--times", AHEAD, *SHORT, "--out", folder / "later")
     return folder
+
+
+SEEN = list[np.ndarray]()
+"""Times of the frames of each pair of halves."""
+
+
+def seen_by_halves(train: hs.Scan, *others: object, **named: object) -> object:
+    SEEN.append(train.instants)
+    return half_sets(train, *others, **named)  # type: ignore[arg-type]
+
+
+def test_halves_are_of_the_run_and_of_its_first_two_thirds(folder):
+    """Times of the scan before those of the run are not in them."""
+    whole, early = SEEN
+    assert whole == pytest.approx(STEP * np.arange(1, TIMES - 1))
+    assert early == pytest.approx(whole[:6])
+
+
+def test_without_half_sets_nothing_is_said_of_errors(folder):
+    """The scan's later frames that the run judges are those within the forecast."""
+    out = folder / "alone"
+    with undrawn():
+        said = worked_by(
+            "forecast", folder / "run", "--no-half-sets", "--times", 2, "--step", 0.512345678901 * STEP, "--out", out
+        )
+    assert "standard error of surfaces: not told" in said.out
+    assert "nothing else was asked, for that needs half-sets" in said.out
+    times, band = read_band(RunFolder(out))
+    assert np.isnan(band).all()
+    assert times == pytest.approx(json.loads((out / "forecast.json").read_text())["times_s"], rel=1e-12, abs=0)
+    assert json.loads((out / "source.json").read_text())["reading"]["time_frames"] == f"{TIMES - 1}:{TIMES}"
+    assert json.loads((out / "config.json").read_text())["method"]["forecast"] == "auto"
 
 
 def test_only_the_first_times_are_tracked(folder):
     summary = json.loads((folder / "run" / "summary.json").read_text())
-    assert summary["times_s"] == pytest.approx(STEP * np.arange(TIMES - 1))
+    assert summary["times_s"] == pytest.approx(STEP * np.arange(1, TIMES - 1))
 
 
 def test_bodies_go_on_with_a_band(folder):
@@ -111,7 +150,7 @@ def test_a_forecast_that_was_cut_off_goes_on(folder, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(acting, "carry_on", cut_off)
-        said = holosplat("forecast", folder / "run", "--times", AHEAD, "--out", out).err
+        said = holosplat("forecast", folder / "run", "--times", AHEAD, *SHORT, "--out", out).err
     assert "go on with --resume" in said
     refused(holosplat("forecast", folder / "run", "--times", 1, "--out", out, "--resume"), "--resume needs the")
     with undrawn():
@@ -126,9 +165,14 @@ def test_what_cannot_be_carried_on_is_refused(folder):
     refused(holosplat("forecast", run, "--degree", 0, "--out", out), "degree")
     refused(holosplat("forecast", run, "--out", folder / "later"), "later")
     refused(holosplat("forecast", run, "--by", "mechanics", "--out", out), "--by mechanics", "--channel")
-    refused(holosplat("forecast", run, "--by", "graph", "--out", out), "6 times at least", "--by paths")
+    refused(holosplat("forecast", run, "--by", "graph", "--out", out), "up to 1.2 windows", "--by paths")
     refused(holosplat("forecast", run, "--weights", folder / "scan.nxs", "--out", out), "scan.nxs", "safetensors file")
     refused(holosplat("forecast", run, "--by", "sindy", "--out", out), "9 times at least", "--by paths")
+    refused(holosplat("forecast", run, "--by", "paths", "--weights", "x", "--out", out), "--weights needs --by auto")
+    refused(holosplat("forecast", run, "--by", "dmd", "--channel", 1, 1, "--out", out), "--channel needs", "mechanics")
+    refused(holosplat("forecast", run, "--by", "graph", "--degree", 3, "--out", out), "--degree needs")
+    refused(holosplat("forecast", run, "--shear-modulus", 1e-6, "--out", out), "--shear-modulus needs --channel")
+    refused(holosplat("forecast", run, "--no-half-sets", "--effort", 2, "--out", out), "--effort needs --half-sets")
     through = ("forecast", run, "--out", out, "--channel", "1e-5", "1e-5")
     refused(holosplat(*through), "within the channel", "--flow-axis")
     refused(holosplat(*through, "--peak", "0.2:0.1"), "--peak", "LOW:HIGH")

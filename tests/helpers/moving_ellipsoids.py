@@ -39,14 +39,14 @@ def ellipsoid(body: int, time: float, subdivisions: int = 3) -> TriangleMesh:
 
 
 @cache
-def truth() -> MeshSeries:
+def truth(times: int = TIMES) -> MeshSeries:
     """The bodies at all times."""
-    half = 0.5 * (TIMES - 1)
+    half = 0.5 * (times - 1)
     scenes = [
         hs.MeshScene.of_one_material([ellipsoid(k, t - half) for k in range(len(BODIES))], MATERIAL)
-        for t in range(TIMES)
+        for t in range(times)
     ]
-    return MeshSeries(tuple(scenes), STEP * np.arange(TIMES))
+    return MeshSeries(tuple(scenes), STEP * np.arange(times))
 
 
 @cache
@@ -61,8 +61,8 @@ def true_paths(degree: int = 2) -> MovingSurfaces:
 
 
 @cache
-def scan(photons: float = 5000.0) -> hs.Scan:
+def scan(photons: float = 5000.0, times: int = TIMES) -> hs.Scan:
     """Four beams over half a turn, five times."""
     views = hs.Views.from_angles(np.array(ANGLES), SHAPE, PIXEL)
-    exposures = hs.Exposures.of(views, 20.0, 0.1).repeated(truth().times)
-    return hs.simulate(truth(), exposures, photons_per_pixel=photons, is_test=np.zeros(len(exposures), bool))
+    exposures = hs.Exposures.of(views, 20.0, 0.1).repeated(truth(times).times)
+    return hs.simulate(truth(times), exposures, photons_per_pixel=photons, is_test=np.zeros(len(exposures), bool))

@@ -11,11 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from holosplat.bodies.rest_shape import moments
 from holosplat.checks import InputError
+from holosplat.matter import Matter
 from holosplat.mesh import TriangleMesh
 from holosplat.metrics.volumes import normal_distance
 from holosplat.motion.cell_model import CellModel, ChannelFrame
-from holosplat.motion.dynamics import whole_cells
+from holosplat.motion.dynamics import DynamicsForecast, carry, whole_cells, window_of
+from holosplat.motion.forecast import History, places_of
 from holosplat.motion.membrane_fit import CellFlow, Unknowns, advanced
+from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.specimens.flow.suspension import Channel, Medium
 from holosplat.specimens.membrane.model import Elasticity, Membrane
 from holosplat.specimens.membrane.rest import geodesic_sphere
@@ -164,3 +167,33 @@ def test_a_flow_is_found_and_what_is_not_told_is_said():
     assert found.told["shear"] > 0.99
     assert float(found.unknowns.shear) == pytest.approx(20e-6**0.5 * 1e-3, rel=0.1)  # the range's middle
     assert found.left[0] < 0.02e-6
+
+
+def test_cells_tell_which_way_the_flow_goes():
+    """A scene that is turned about has the turned forecast, by the same options."""
+    times, about = 1e-5 * np.arange(10), np.diag([1.0, -1.0, -1.0])
+    way = model().run([cell()], times, Unknowns.of(0.05, 5e-6))[0]
+    basis, ahead = TimeBasis(times[0], times[-1], 3, 2), times[-1] + np.array([2e-5])
+    found = []
+    for turn in (np.eye(3), about):
+        paths = [basis.fitted(times, way @ turn.T)]
+        bodies = MovingSurfaces.of_bodies(paths, [FACES], basis, 0.5e-6, Matter.one(1e-7, 0.0))
+        found.append(carry(History(bodies, times), ahead, DynamicsForecast(FRAME)))
+    one, other = (places_of(each.bodies, ahead)[0][0] for each in found)
+    assert other == pytest.approx(one @ about.T, abs=5e-9)
+    assert found[1].told["peak_m_s"] == pytest.approx(found[0].told["peak_m_s"], rel=1e-3)
+
+
+def test_what_paths_leave_of_the_state_is_an_error_of_mechanics():
+    """Cells begin on parabolas: where their paths end beside these, so does the forecast."""
+    times = 1e-5 * np.arange(10)
+    way = model().run([cell()], times, Unknowns.of(0.05, 5e-6))[0]
+    basis, found = TimeBasis(times[0], times[-1], 5, 3), []
+    for bent in (0.0, 0.5e-6):
+        bend = bent * np.exp((times - times[-1]) / 1e-5)[:, None, None] * [1.0, 0.0, 0.0]
+        bodies = MovingSurfaces.of_bodies(
+            [basis.fitted(times, way + bend)], [FACES], basis, 5e-7, Matter.one(1e-7, 0.0)
+        )
+        history = History(bodies, times)
+        found.append(window_of(history, times[-1] + np.array([1e-5]), DynamicsForecast(FRAME)).spread[-1, 0])
+    assert found[0] < 0.02e-6 < 0.03e-6 < found[1] < 0.2e-6

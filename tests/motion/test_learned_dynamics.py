@@ -216,12 +216,15 @@ def test_what_cannot_be_foretold_is_refused(untrained, tmp_path):
 
 def test_a_network_that_cannot_look_so_far_is_left_out_and_said_to_be(untrained):
     options = ForecastOptions(learned=GraphForecast(untrained), decides=True)
-    history = History(straight(), TIMES)
+    history = History(straight(), TIMES, early=(straight(TIMES[:8]), straight(TIMES[:8])))
     others, left_out = _others(options, history, TIMES[-1] + np.array([2e-4]))
     assert others == []
     assert "graph was not asked" in left_out
     assert "fewer --times" in left_out
     assert _others(options, history, AHEAD) == ([options.learned], "")
+    others, left_out = _others(options, History(straight(), TIMES), AHEAD)
+    assert others == []
+    assert "needs half-sets" in left_out
 
 
 def test_paths_and_the_network_are_decided_by_times_that_neither_saw(untrained):
@@ -343,7 +346,7 @@ def test_cells_of_another_simulator(espresso_rbc):
     fitted = [basis.fitted(times[:24], np.array([mesh.vertices for mesh in path[:24]])) for path in paths]
     bodies = MovingSurfaces.of_bodies(fitted, [path[0].faces for path in paths], basis, 1e-6, Matter.one(1e-7, 0.0))
     ahead = times[[last + 15, last + 25]]
-    found, others = learned(History(bodies, times[:24]), ahead), extrapolate(bodies, times[:24], ahead)
+    found, others = learned(History(bodies, times[:24]), ahead), extrapolate(History(bodies, times[:24]), ahead)
     for n, time in enumerate(ahead):
         for k, path in enumerate(paths):
             missed = normal_distance(found.bodies.bodies(time)[k], path[24 + n])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -116,3 +118,12 @@ def test_what_one_beam_sees_is_in_the_field():
     at = lambda *centre: TriangleMesh(3e-6 * sphere + 1e-6 * np.array(centre), faces)  # noqa: E731
     parts = [measure(at(*c), np.zeros_like(sphere), 0.0, 0, views).in_field for c in ((20, 0, 0), (0, 10.5, 0))]
     assert parts == pytest.approx([1.0, 0.5], abs=0.05)
+
+
+def test_a_cone_shows_less_of_what_is_near_its_source():
+    """Of a source at 50 µm, a field of 31 µm shows 21.7 µm at 15 µm before the plane, and 40.3 µm behind it."""
+    views = replace(Views.from_angles([0.0], (31, 31), 1e-6), sources=np.array([50e-6]))
+    sphere, faces = icosphere(3)
+    at = lambda x, z: TriangleMesh(2e-6 * sphere + [1e-6 * x, 0, 1e-6 * z], faces)  # noqa: E731
+    parts = [measure(at(*place), np.zeros_like(sphere), 0.0, 0, views).in_field for place in ((13.2, -15), (17.5, 15))]
+    assert parts == [0.0, 1.0]

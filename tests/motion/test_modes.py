@@ -36,7 +36,9 @@ def bodies() -> MovingSurfaces:
     return MovingSurfaces.of_bodies(paths, [FACES, FACES], basis, 0.5e-6, Matter.one(1e-7, 0.0))
 
 
-@pytest.mark.parametrize(("by", "library"), [(DmdForecast(), "pydmd"), (SindyForecast(), "pysindy")])
+@pytest.mark.parametrize(
+    ("by", "library"), [(DmdForecast(keep_volume=False), "pydmd"), (SindyForecast(keep_volume=False), "pysindy")]
+)
 def test_a_damped_swing_goes_on(by, library):
     pytest.importorskip(library)
     found = by.fit(History(bodies(), TIMES)).ahead(AHEAD)
@@ -82,3 +84,10 @@ def test_what_is_missing_is_said(monkeypatch):
     monkeypatch.setattr(importlib, "import_module", gone)
     with pytest.raises(MissingError, match=r"needs pydmd: pip install 'holosplat\[dynamics\]'"):
         DmdForecast().fit(History(bodies(), TIMES))
+
+
+def test_bodies_keep_their_volume():
+    pytest.importorskip("pydmd")
+    found = DmdForecast().fit(History(bodies(), TIMES)).ahead(AHEAD).bodies
+    usual = np.mean([bodies().bodies(t)[0].volume for t in TIMES])
+    assert [found.bodies(t)[0].volume for t in AHEAD] == pytest.approx([usual] * 3, rel=1e-6, abs=0)

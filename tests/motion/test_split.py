@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from holosplat.motion.forecast import Split, Window, believed, shrunk
+from holosplat.motion.split import Split, Window, believed, shrunk
 from holosplat.specimens.red_cells import icosphere
 
 TIMES = np.linspace(1.0, 2.5, 11)

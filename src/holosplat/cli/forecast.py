@@ -26,6 +26,7 @@ from ..specimens.flow.suspension import PLASMA_VISCOSITY
 from ..workflows.evaluate import evaluate
 from ..workflows.forecast import (
     FRAMES,
+    SAME_TIME,
     TABLE,
     Forecasted,
     ForecastOptions,
@@ -44,6 +45,12 @@ from ..workflows.track import COLLECTION, TRACKS
 from .places import Output
 from .progress import ProgressBar
 from .sentence import interruptible, put, say, tell
+
+MECHANICAL = ("auto", "mechanics", "hybrid", "assimilate")
+OF_CHANNEL = ("flow_axis", "channel_centre", "peak", "shear_modulus", "viscosity", "back")
+"""Options of the mechanics, beside the channel."""
+TAKEN = {"weights": ("auto", "graph", "hybrid"), "degree": ("paths", "rigid", *MECHANICAL), "channel": MECHANICAL}
+"""Options that some ways alone take."""
 
 
 @checked_dataclass
@@ -70,7 +77,7 @@ class ForecastFlags:
     """Whether paths are fitted again to two halves of the times, which say what is believed, and the error."""
     keep_volume: bool = True
     """Whether bodies keep their volume."""
-    effort: float = 1.0
+    effort: Positive = 1.0
     """Factor of the numbers of steps of these fits."""
 
     back: Many = 8
@@ -78,7 +85,7 @@ class ForecastFlags:
     channel: tuple[Small, Small] | None = None
     """Extents [m] of a rectangular channel across the flow, along the other two axes in the order x, y, z."""
     flow_axis: Literal["x", "y", "z"] = "y"
-    """Along which axis of the object it leads; a flow along the rotation axis is one along y."""
+    """Along which axis of the object it leads, either way; a flow along the rotation axis is one along y."""
     channel_centre: tuple[Signed, Signed, Signed] = (0.0, 0.0, 0.0)
     """A point on its axis (x, y, z) [m]."""
     peak: str | None = None
@@ -89,18 +96,25 @@ class ForecastFlags:
     """Of the fluid in and around cells [Pa s]."""
 
     def options(self) -> ForecastOptions:
-        """The options of the forecast."""
+        """The options of the forecast; `InputError` for ones that this way does not take."""
+        usual = ForecastFlags()
+        for name, ways in TAKEN.items():
+            given = getattr(self, name) != getattr(usual, name)
+            require(self.by in ways or not given, f"--{name} needs --by {', '.join(ways[:-1])} or {ways[-1]}.")
+        for name in OF_CHANNEL:
+            given = getattr(self, name) != getattr(usual, name)
+            require(self.channel is not None or not given, f"--{name.replace('_', '-')} needs --channel.")
+        require(self.half_sets or self.effort == usual.effort, "--effort needs --half-sets.")
         step = 0.0 if self.step is None else positive("--step", self.step, "seconds")
         model = PathForecast(self.degree, self.window, self.by == "rigid", self.keep_volume)
-        fit = MotionFit()
-        steps = max(1, round(positive("--effort", self.effort) * fit.schedule.steps))
-        fit = replace(fit, schedule=replace(fit.schedule, steps=steps))
         learned, decides = self._learned(), self.by == "auto"
-        return ForecastOptions(self.times, step, model, self._dynamics(model), learned, decides, self.half_sets, fit)
+        return ForecastOptions(
+            self.times, step, model, self._dynamics(model), learned, decides, self.half_sets, self.effort
+        )
 
     def _learned(self) -> GraphForecast | DmdForecast | SindyForecast | None:
         if self.by == "dmd" or self.by == "sindy":
-            return (DmdForecast if self.by == "dmd" else SindyForecast)(self.window)
+            return (DmdForecast if self.by == "dmd" else SindyForecast)(self.window, self.keep_volume)
         if self.by in ("graph", "hybrid", "auto"):
             return GraphForecast(self.weights, self.window, self.keep_volume)
         return None
@@ -156,7 +170,7 @@ def forecast(
     require_cells(tracked, times, options)
     scan = _whole_scan(folder)
     known = scan.exposures[scan.exposures.time <= times[-1]]
-    tell("the forecast", of_forecast(known, options.fit.schedule.views_per_step), out)
+    tell("the forecast", of_forecast(known, MotionFit().schedule.views_per_step), out)
     config = config_of(options, scan, folder.read_config(), seed)
     with claimed(new):
         if not goes_on(new, config, resume):
@@ -183,16 +197,17 @@ def _whole_scan(folder: RunFolder) -> Scan:
 
 def _source(folder: RunFolder, scan: Scan, found: Forecasted, out: Path) -> dict[str, object]:
     """What source.json says: the later times of the run's scan, or else the predicted frames."""
-    later = np.flatnonzero(scan.instants > found.forecast.bodies.basis.first)[: len(found.forecast.times)]
-    if not len(later):
+    if not found.judged:
         return run_source(out / FRAMES, Reading())
+    later = np.searchsorted(scan.instants, [found.judged[0]["time_s"], found.judged[-1]["time_s"]])
     own = run_reading(folder.path)
-    part = replace(own.part, time_frame=None, time_frames=f"{later[0]}:{later[-1] + 1}")
+    part = replace(own.part, time_frame=None, time_frames=f"{later[0]}:{later[1] + 1}")
     return run_source(folder.source_scan(), replace(own, part=part))
 
 
 def _shown(scan: Scan, found: Forecasted) -> Scan:
     """What the report shows of the last time: frames that the run did not see, or else those that are predicted."""
     last = found.forecast.times[-1]
-    held_out = scan[np.flatnonzero(np.isclose(scan.exposures.time, last, rtol=1e-6, atol=0))]
+    slack = SAME_TIME * (last - found.forecast.bodies.basis.first)
+    held_out = scan[np.flatnonzero(np.abs(scan.exposures.time - last) <= slack)]
     return held_out if len(held_out) else found.predicted[np.flatnonzero(found.predicted.exposures.time == last)]

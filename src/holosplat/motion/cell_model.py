@@ -52,12 +52,14 @@ class ChannelFrame:
     """A rectangular channel in the object frame.
 
     axis: of the flow; across: its extents [m] along the two other axes, in the order x, y, z; centre: [m] of its
-    section, of which the part along the flow does not matter. Errors: `InputError` for extents that are none.
+    section, of which the part along the flow does not matter; back: whether the flow goes the other way along the axis.
+    Errors: `InputError` for extents that are none.
     """
 
     across: tuple[Small, Small]
     axis: Literal["x", "y", "z"] = "y"
     centre: tuple[Signed, Signed, Signed] = (0.0, 0.0, 0.0)
+    back: bool = False
 
     def __post_init__(self) -> None:
         for extent in self.across:
@@ -87,6 +89,7 @@ class ChannelFrame:
         along = AXES.index(self.axis)
         order = [along, *(k for k in range(3) if k != along)]
         rotation = np.eye(3)[order]
+        rotation[0] *= -1 if self.back else 1
         rotation[2] *= np.sign(np.linalg.det(rotation))
         return rotation
 
@@ -221,7 +224,7 @@ class CellModel:
         A cell without force goes with the mean of the flow about it, here over its surface.
         """
         profile = [self.frame.channel.speed(torch.from_numpy(self.frame.inward(x))).mean().item() for x in places]
-        along = [float(v.mean(0)[AXES.index(self.frame.axis)]) for v in speeds]
+        along = [float(v.mean(0) @ self.frame.rotation[0]) for v in speeds]
         return float(np.dot(profile, along) / np.dot(profile, profile))
 
     def fitted(

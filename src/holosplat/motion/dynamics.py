@@ -25,12 +25,12 @@ from .cell_model import CellModel, ChannelFrame, Range
 from .forecast import (
     Forecast,
     Forecaster,
-    Halves,
     History,
     Model,
     PathForecast,
     extrapolate,
     half_apart,
+    left_of,
     of_volume,
     on_paths,
     places_of,
@@ -51,10 +51,10 @@ PEAK = 0.04
 class DynamicsForecast:
     """How cells move on by mechanics."""
 
-    kind: ClassVar[str] = "dynamics"
+    kind: ClassVar[str] = "mechanics"
 
     frame: ChannelFrame
-    """The channel."""
+    """The channel; cells tell which way the flow goes along its axis."""
     peak: Range = (0.0, 0.0)
     """Velocity of the undisturbed flow on the axis [m/s], a range; (0, 0): found from the bodies' velocities."""
     shear: Range = (2e-6, 10e-6)
@@ -72,7 +72,7 @@ class DynamicsForecast:
 
     def fit(self, history: History) -> Model:
         """Mechanics on the history."""
-        return Model(lambda ahead: carry(history.bodies, history.times, ahead, self, history.halves))
+        return Model(lambda ahead: carry(history, ahead, self))
 
     def __post_init__(self) -> None:
         in_range("viscosity", self.viscosity, 1e-6, 1e3, unit="pascal seconds")
@@ -116,20 +116,14 @@ class Window:
         return Forecast(on_paths(self.bodies, self.every, places), self.every[1:], band)
 
 
-def carry(
-    bodies: MovingSurfaces,
-    times: np.ndarray,
-    ahead: np.ndarray,
-    options: DynamicsForecast,
-    halves: Halves | None = None,
-) -> Forecast:
-    """`bodies`, fitted at `times` [T] s, at the later times `ahead` [N] s; told: what was found of the flow.
+def carry(history: History, ahead: np.ndarray, options: DynamicsForecast) -> Forecast:
+    """The bodies of `history` at the later times `ahead` [N] s; told: what was found of the flow.
 
     Whole cells within the channel go by mechanics, from the state that their paths have at the last time; all others
     as `extrapolate` says. The band has the state's part, and what the model left of the window, growing with time.
     Errors: `InputError` where no body is a whole cell within the channel.
     """
-    window = window_of(bodies, times, ahead, options, halves)
+    window = window_of(history, ahead, options)
     ranges = {"peak": window.peak, "shear": options.shear}
     tracked = [window.seen[k] for k in window.cells]
     fitted = window.model.fitted(window.meshes(0), tracked, window.past, ranges, options.free)
@@ -139,18 +133,14 @@ def carry(
     return replace(window.gone_on(later, fitted.left), told=fitted.as_dict())
 
 
-def window_of(
-    bodies: MovingSurfaces,
-    times: np.ndarray,
-    ahead: np.ndarray,
-    options: DynamicsForecast,
-    halves: Halves | None = None,
-) -> Window:
+def window_of(history: History, ahead: np.ndarray, options: DynamicsForecast) -> Window:
     """Initial state of the mechanics, as of `carry`."""
+    bodies, times, halves = history.bodies, history.times, history.halves
     known = options.paths.times(times)
     past = known[-1 - min(options.back, max(1, len(known) // 3)) :]
     seen, spread = smoothed(bodies, known, past, options.paths, halves)
-    base = extrapolate(bodies, times, ahead, options.paths, halves)
+    spread = np.hypot(spread, np.sqrt(left_of(history, [one[-1:] for one in seen], spread[-1])))
+    base = extrapolate(history, ahead, options.paths)
     faces = [bodies.body(k)[1].numpy() for k in range(bodies.count)]
     cells = whole_cells([TriangleMesh(one[-1], f) for one, f in zip(seen, faces)], options.frame)
     require(
@@ -159,7 +149,10 @@ def window_of(
         "--channel, --flow-axis and --channel-centre.",
     )
     last = [TriangleMesh(seen[k][-1], faces[k]) for k in cells]
-    model = CellModel(options.frame, last, float(np.sqrt(np.prod(options.shear))), options.viscosity)
+    speeds = bodies.velocities(float(times[-1]))
+    along = sum(float(speeds[k].mean(0) @ options.frame.rotation[0]) for k in cells)
+    frame = replace(options.frame, back=options.frame.back != (along < 0))
+    model = CellModel(frame, last, float(np.sqrt(np.prod(options.shear))), options.viscosity)
     peak = _peak(model, bodies, cells, known, options)
     return Window(bodies, options, past, np.r_[times[-1], ahead], seen, spread, base, cells, model, peak)
 

@@ -7,8 +7,6 @@ from dataclasses import dataclass, field, replace
 from typing import ClassVar, Protocol
 
 import numpy as np
-from numpy.polynomial import legendre
-from scipy.spatial.transform import Rotation
 
 from ..checks import InputError, in_range
 from ..inference import Decision, Score, select
@@ -16,138 +14,7 @@ from ..mesh import TriangleMesh, across, areas
 from ..ranges import ranged
 from ..representations import MovingSurfaces, TimeBasis
 from ..representations.flow import path_positions
-
-PARTS = ("centre", "turn", "stretch", "rest")
-MOST_REST = 1
-"""Highest power of time of the rest: of the next one, fits of paths hold more noise than motion, and half-sets do not
-notice, for both begin at the same fit and keep its fine noise."""
-POOLED = 2.0
-"""What a coefficient's variance in the other bodies counts against a body's own, which one difference tells."""
-
-
-@dataclass(frozen=True)
-class Window:
-    """Times [s] from `first` to `last`, whose Legendre polynomials are used up to `degree`."""
-
-    first: float
-    last: float
-    degree: int = 2
-
-    def scaled(self, times: np.ndarray) -> np.ndarray:
-        """Times [T] such that the window is -1 … 1."""
-        return 2 * (np.asarray(times, dtype=np.float64) - self.first) / (self.last - self.first) - 1
-
-    def coefficients(self, times: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Least-squares coefficients [D + 1, …] of polynomials through `values` [T, …] at `times` [T]."""
-        flat = np.reshape(values, (len(times), -1))
-        found = legendre.legfit(self.scaled(times), flat, min(self.degree, len(times) - 1))
-        full = np.zeros((self.degree + 1, flat.shape[1]))
-        full[: len(found)] = found
-        return full.reshape(self.degree + 1, *np.shape(values)[1:])
-
-    def values(self, times: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
-        """[T, …] at `times` [T], in the window or beyond."""
-        weights = legendre.legvander(self.scaled(times), len(coefficients) - 1)
-        return np.tensordot(weights, coefficients, axes=1)
-
-
-@dataclass(frozen=True)
-class Split:
-    """Coefficients of one body's parts: centre and turn [D + 1, 3] [m, rad], stretch [D + 1, 3, 3], rest [D + 1, P, 3]
-    [m]; shape [P, 3] [m], the reference about its middle, to which turn, stretch and rest are relative."""
-
-    shape: np.ndarray
-    centre: np.ndarray
-    turn: np.ndarray
-    stretch: np.ndarray
-    rest: np.ndarray
-
-    @classmethod
-    def of(cls, places: np.ndarray, times: np.ndarray, window: Window, weights: np.ndarray, reference: int) -> Split:
-        """The parts of the places [T, P, 3] [m] of a body's vertices at `times` [T].
-
-        weights: [P] of the vertices, such as the areas around them; reference: number of the time of the shape.
-        """
-        weights = weights / weights.sum()
-        centre = np.einsum("p,tpx->tx", weights, places)
-        local = places - centre[:, None]
-        shape = local[reference]
-        turns = np.array([_turn(shape, one, weights) for one in local])
-        own = np.einsum("tji,tpj->tpi", turns, local) - shape
-        second = np.einsum("p,pi,pj->ij", weights, shape, shape)
-        moments = np.einsum("p,pi,tpj->tij", weights, shape, own)
-        stretch = np.linalg.solve(second, moments)
-        rest = own - np.einsum("pi,tij->tpj", shape, stretch)
-        vectors = Rotation.from_matrix(turns).as_rotvec()
-        found = (window.coefficients(times, part) for part in (centre, vectors, stretch, rest))
-        return cls(shape, *found)
-
-    def places(self, times: np.ndarray, window: Window) -> np.ndarray:
-        """[T, P, 3] [m] at `times` [T], beyond the window too."""
-        centre, vectors, stretch, rest = (window.values(times, getattr(self, name)) for name in PARTS)
-        own = self.shape + np.einsum("pi,tij->tpj", self.shape, stretch) + rest
-        turns = Rotation.from_rotvec(vectors).as_matrix()
-        return centre[:, None] + np.einsum("tij,tpj->tpi", turns, own)
-
-    def stiffened(self, window: Window) -> Split:
-        """The same motion of a body that keeps the shape of the window's last time."""
-        last = [window.values(np.array([window.last]), part)[0] for part in (self.stretch, self.rest)]
-        still = [np.concatenate([one[None], np.zeros((window.degree, *one.shape))]) for one in last]
-        return Split(self.shape, self.centre, self.turn, *still)
-
-
-def shrunk(splits: Sequence[Split], halves: tuple[Sequence[Split], Sequence[Split]] | None) -> list[Split]:
-    """Each coefficient moved towards what it is without data, as far as two half-sets of the data disagree on it.
-
-    A coefficient q has the variance σ² = (q₁ - q₂)²/4 in a body, of which the median over bodies counts `POOLED` times
-    as much as its own; how large it is in truth, τ², is the median of q² less that of σ². It is multiplied by
-    τ²/(τ² + σ²) (empirical Bayes; Efron & Morris 1973, J. Am. Stat. Assoc. 68, 117). Without data centres go with
-    their median velocity, and all else stays. The rest has one factor a power of time, and none above `MOST_REST`. The
-    means over the window (power 0) are kept. Without `halves` all of this is.
-    """
-    changed = []
-    for name in ("centre", "turn", "stretch"):
-        values = np.array([getattr(one, name) for one in splits])
-        usual = np.zeros_like(values)
-        if name == "centre":
-            usual[:, 1] = np.median(values[:, 1], axis=0)
-        noise = 0 * values if halves is None else _differences(halves, name) ** 2 / 4
-        factors = believed(noise, (values - usual) ** 2)
-        factors[:, 0] = 1.0
-        changed.append(usual + factors * (values - usual))
-    rests = [factor[:, None, None] * one.rest for factor, one in zip(_rest_factors(splits, halves), splits)]
-    return [Split(one.shape, *parts) for one, *parts in zip(splits, *changed, rests)]
-
-
-def believed(noise: np.ndarray, square: np.ndarray) -> np.ndarray:
-    """τ²/(τ² + σ²) [B, …], from the `noise` squared and the `square` of coefficients [B, …]; 1 without noise."""
-    usual = np.median(noise, axis=0)
-    own = (POOLED * usual + noise) / (POOLED + 1)
-    true = np.maximum(np.median(square, axis=0) - usual, 0)
-    return np.where(own > 0, true / np.maximum(true + own, np.finfo(float).tiny), 1.0)
-
-
-def _differences(halves: tuple[Sequence[Split], Sequence[Split]], name: str) -> np.ndarray:
-    return np.array([getattr(a, name) - getattr(b, name) for a, b in zip(*halves)])
-
-
-def _rest_factors(splits: Sequence[Split], halves: tuple[Sequence[Split], Sequence[Split]] | None) -> np.ndarray:
-    """[B, D + 1] of the rest's powers of time."""
-    square = np.array([(one.rest**2).mean((1, 2)) for one in splits])
-    noise = 0 * square
-    if halves is not None:
-        noise = np.array([((a.rest - b.rest) ** 2).mean((1, 2)) / 4 for a, b in zip(*halves)])
-    factors = believed(noise, square)
-    factors[:, 0], factors[:, MOST_REST + 1 :] = 1.0, 0.0
-    return factors
-
-
-def _turn(shape: np.ndarray, other: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """The rotation R [3, 3] with which R shape comes nearest to `other`, both [P, 3] about their middles."""
-    left, _, right = np.linalg.svd(np.einsum("p,pi,pj->ij", weights, other, shape))
-    sign = np.sign(np.linalg.det(left @ right))
-    return left @ np.diag([1.0, 1.0, sign]) @ right
-
+from .split import Split, Window, shrunk
 
 Places = list[np.ndarray]
 """Of each body the places [T, P, 3] [m] of its vertices."""
@@ -183,7 +50,7 @@ class PathForecast:
 
     def fit(self, history: History) -> Model:
         """The paths as they go on."""
-        return Model(lambda ahead: extrapolate(history.bodies, history.times, ahead, self, history.halves))
+        return Model(lambda ahead: extrapolate(history, ahead, self))
 
 
 @dataclass(frozen=True)
@@ -207,11 +74,23 @@ class Forecast:
 @dataclass(frozen=True)
 class History:
     """What a forecast begins with. bodies: fitted to frames at `times` [T] s; halves: fits to two halves of them, which
-    say how far each part of the motion is believed and how uncertain the forecast is."""
+    say how far each part of the motion is believed and how uncertain the forecast is; early: such fits to the frames of
+    the first two thirds of the times alone, which later frames never changed. Without them bodies count as exact."""
 
     bodies: MovingSurfaces
     times: np.ndarray
     halves: Halves | None = None
+    early: Halves | None = None
+
+    @property
+    def before(self) -> History:
+        """The history that ends with the first two thirds of the times, from which forecasts are tested."""
+        times = self.times[: early_count(len(self.times))]
+        if self.early is None:
+            return History(self.bodies, times, self.halves)
+        one, other = self.early
+        mean = one.with_parameters({"coefficients": 0.5 * (one.coefficients + other.coefficients)})
+        return History(mean, times, self.early)
 
     def last(self, count: int) -> np.ndarray:
         """The last `count` times [s] (0: all)."""
@@ -236,18 +115,17 @@ class Forecaster(Protocol):
         ...
 
 
-def extrapolate(
-    bodies: MovingSurfaces,
-    times: np.ndarray,
-    ahead: np.ndarray,
-    options: PathForecast = PathForecast(),
-    halves: Halves | None = None,
-) -> Forecast:
-    """`bodies`, fitted to frames at `times` [T] s, at the later times `ahead` [N] s.
+def early_count(times: int) -> int:
+    """How many of so many times are the first two thirds."""
+    return (2 * times + 2) // 3
 
-    halves: fits to two halves of the frames, which say how far each part of the motion is believed and how uncertain
-    the forecast is. The band is half of what forecasts from the two differ by, and what a forecast of the window's last
-    time from its first two thirds misses beyond that, growing with the square of the time ahead, counted in windows.
+
+def extrapolate(history: History, ahead: np.ndarray, options: PathForecast = PathForecast()) -> Forecast:
+    """The paths of `history` at the later times `ahead` [N] s.
+
+    The band is half of what forecasts from two halves of the frames differ by, what the model leaves of the last time
+    beyond its noise, and what a forecast of this from the first two thirds of the times misses beyond its noise, which
+    grows with the square of the time ahead.
     """
 
     def say(
@@ -255,14 +133,14 @@ def extrapolate(
     ) -> tuple[Places, np.ndarray]:
         return smoothed(of, window, later, replace(options, window=0), both)
 
-    return told_by(say, bodies, options.times(times), ahead, halves, options.degree)
+    return told_by(say, history, options.times, ahead, options.degree)
 
 
 def decided(history: History, paths: PathForecast, others: Sequence[Forecaster]) -> Decision:
     """Whether bodies go on as `paths` or as another way says, from simple to complex: which tells the last third of the
     times better from those before. Bodies are the blocks of the score; ways that cannot be asked are left out."""
-    early, late = np.split(history.times, [(2 * len(history.times) + 2) // 3])
-    before = History(history.bodies, early, history.halves)
+    before = history.before
+    late = history.times[len(before.times) :]
     truth = places_of(history.bodies, late)
     scores, by = dict[str, Score](), "the last third of the run's times"
     for way in (paths, *others):
@@ -284,21 +162,26 @@ Say = Callable[[MovingSurfaces, np.ndarray, np.ndarray, "Halves | None"], "tuple
 
 
 def told_by(
-    say: Say, bodies: MovingSurfaces, window: np.ndarray, ahead: np.ndarray, halves: Halves | None, degree: int
+    say: Say, history: History, windowed: Callable[[np.ndarray], np.ndarray], ahead: np.ndarray, degree: int
 ) -> Forecast:
-    """The forecast of `say` with the band of `extrapolate`; degree: times of which no forecast can be tested."""
+    """The forecast of `say` with the band of `extrapolate`; windowed: which of some times it sees; degree: times of
+    which no forecast can be tested."""
+    window, bodies = windowed(history.times), history.bodies
     last = window[-1]
-    places, spread = say(bodies, window, np.r_[last, ahead], halves)
-    missed, horizon = _backtest(say, bodies, window, halves, degree)
-    growth = ((ahead - last) / (last - window[0]) / horizon) ** 2
-    band = np.hypot(spread[1:], growth[:, None] * missed)
+    places, spread = say(bodies, window, np.r_[last, ahead], history.halves)
+    missed, tested = _backtest(say, history, windowed, degree)
+    band = np.sqrt(
+        spread[1:] ** 2 + left_of(history, places, spread[0]) + ((ahead - last) / tested)[:, None] ** 4 * missed
+    )
     return Forecast(on_paths(bodies, np.r_[last, ahead], places), ahead, band)
 
 
-def on_paths(bodies: MovingSurfaces, times: np.ndarray, places: Places) -> MovingSurfaces:
-    """The same bodies on paths through `places` at `times` [N + 1], two at least."""
+def on_paths(
+    bodies: MovingSurfaces, times: np.ndarray, places: Places, basis: TimeBasis | None = None
+) -> MovingSurfaces:
+    """The same bodies on paths through `places` at `times` [N + 1], two at least; near them on a given `basis`."""
     degree = min(SMOOTH, len(times) - 1)
-    basis = TimeBasis(float(times[0]), float(times[-1]), degree, len(times) - degree)
+    basis = basis or TimeBasis(float(times[0]), float(times[-1]), degree, len(times) - degree)
     paths = [basis.fitted(times, one) for one in places]
     faces = [bodies.body(k)[1].numpy() for k in range(bodies.count)]
     found = MovingSurfaces.of_bodies(paths, faces, basis, bodies.unit_length, bodies.matter)
@@ -315,9 +198,11 @@ def places_of(bodies: MovingSurfaces, times: np.ndarray) -> Places:
 
 
 def half_apart(bodies: MovingSurfaces, one: Places, other: Places) -> np.ndarray:
-    """[T, B] m: half of what two places of each of the `bodies` differ by along its normals, their standard error."""
+    """[T, B] m: the standard error of each of the `bodies` along its normals, half of what two of its places differ by,
+    squared in equal parts that of the body and the mean of all: one difference tells little."""
     faces = (bodies.body(k)[1].numpy() for k in range(bodies.count))
-    return 0.5 * np.stack([across(a, b, f) for a, b, f in zip(one, other, faces)], axis=1)
+    squares = 0.25 * np.stack([across(a, b, f) for a, b, f in zip(one, other, faces)], axis=1) ** 2
+    return np.sqrt(0.5 * (squares + squares.mean(1, keepdims=True)))
 
 
 def smoothed(
@@ -366,18 +251,48 @@ def of_volume(vertices: np.ndarray, faces: np.ndarray, volume: float) -> np.ndar
     return middle + share ** (1 / 3) * (vertices - middle) if share > 0 else vertices
 
 
+def of_kept_volume(bodies: MovingSurfaces, times: np.ndarray, places: Places) -> Places:
+    """`places` of each body, such that it has its mean volume at `times`."""
+    found = []
+    for k, (before, later) in enumerate(zip(places_of(bodies, times), places)):
+        faces = bodies.body(k)[1].numpy()
+        usual = float(np.mean([TriangleMesh(one, faces).volume for one in before]))
+        found.append(np.array([of_volume(one, faces, usual) for one in later]))
+    return found
+
+
+def left_of(history: History, said: Places, spread: np.ndarray) -> np.ndarray:
+    """[B] m² what the first places that are `said` of the last time, smooth ones of error `spread` [B] m, leave of the
+    bodies there, as of `_beyond`."""
+    return _beyond(history, said, np.sqrt(np.maximum(_error_at_end(history) ** 2 - spread**2, 0)))
+
+
+def _error_at_end(history: History) -> np.ndarray:
+    """[B] m, standard error of the bodies at the last time; 0 without halves."""
+    if history.halves is None:
+        return np.zeros(history.bodies.count)
+    return half_apart(history.bodies, *(places_of(half, history.times[-1:]) for half in history.halves))[0]
+
+
 def _backtest(
-    say: Say, bodies: MovingSurfaces, times: np.ndarray, halves: Halves | None, degree: int
+    say: Say, history: History, windowed: Callable[[np.ndarray], np.ndarray], degree: int
 ) -> tuple[np.ndarray, float]:
-    """Error of a forecast of the last time from the first two thirds for each body [B] m beyond its noise, together
-    with the median of all, and how far ahead it looked, in its own windows; NaN for fewer times than it needs."""
-    early = times[: (2 * len(times) + 2) // 3]
-    if len(early) <= degree or len(early) == len(times):
-        return np.full(bodies.count, np.nan), 1.0
-    said, spread = say(bodies, early, times[-1:], halves)
-    squares = np.zeros(bodies.count)
-    for k, (one, other) in enumerate(zip(said, places_of(bodies, times[-1:]))):
-        missed = across(one, other, bodies.body(k)[1].numpy())[0]
-        squares[k] = max(float(missed**2 - spread[0, k] ** 2), 0.0)
-    horizon = float((times[-1] - early[-1]) / (early[-1] - early[0]))
-    return np.sqrt(0.5 * (squares + np.median(squares))), horizon
+    """Squared error [B] m² of a forecast of the last time from the first two thirds, as of `_beyond`, and how long
+    ahead that is [s]; NaN for fewer times than it needs."""
+    before, last = history.before, history.times[-1:]
+    early = windowed(before.times)
+    if len(early) <= degree or len(before.times) == len(history.times):
+        return np.full(history.bodies.count, np.nan), 1.0
+    said, spread = say(before.bodies, early, last, before.halves)
+    return _beyond(history, said, np.hypot(spread[0], _error_at_end(history))), float(last[0] - early[-1])
+
+
+def _beyond(history: History, said: Places, noise: np.ndarray) -> np.ndarray:
+    """[B] m²: the squared distance of the first places that are `said` from the bodies at the last time, in equal parts
+    of the body and the median of all; of it the share that the median is beyond that of the `noise` [B] m, squared."""
+    pairs = enumerate(zip(said, places_of(history.bodies, history.times[-1:])))
+    faces = history.bodies.body
+    away = np.array([across(one[:1], true, faces(k)[1].numpy())[0] for k, (one, true) in pairs]) ** 2
+    usual = np.median(away)
+    share = max(1 - np.median(noise**2) / max(usual, np.finfo(float).tiny), 0.0)
+    return 0.5 * share * (away + usual)

@@ -31,7 +31,7 @@ from ..mesh import TriangleMesh
 from ..ranges import ManyOrNone, Natural, ranged
 from ..specimens.flow.suspension import PLASMA_VISCOSITY
 from ..specimens.membrane.model import Elasticity
-from .forecast import Forecast, History, Model, half_apart, of_volume, on_paths, places_of
+from .forecast import Forecast, History, Model, half_apart, of_kept_volume, on_paths, places_of
 
 SHIPPED, VERSION = Path(__file__).with_name("flowing_cells.safetensors"), "dynamics 1"
 DEGREE = 4
@@ -333,11 +333,9 @@ def learned(history: History, ahead: np.ndarray, options: GraphForecast = GraphF
         errors = trained.calibration * spread_of(spread.double(), horizon[1:])
     said = []
     for k, state in enumerate(states):
-        later = state.later(trained.network, found[k].double(), horizon).numpy()
-        if options.keep_volume:
-            usual = float(np.mean([TriangleMesh(one, faces[k]).volume for one in places[k]]))
-            later = np.array([of_volume(one, faces[k], usual) for one in later])
-        said.append(later)
+        said.append(state.later(trained.network, found[k].double(), horizon).numpy())
+    if options.keep_volume:
+        said = of_kept_volume(bodies, known, said)
     band = (radii[:, None] * (errors.square().mean(1) + place[:, None]).sqrt()).T.numpy()
     return Forecast(on_paths(bodies, np.r_[known[-1], ahead], said), ahead, band)
 

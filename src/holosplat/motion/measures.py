@@ -8,7 +8,7 @@ difference is a draw of the error of the result. It tells what noise does, and n
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import astuple, dataclass, fields
+from dataclasses import astuple, dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -22,8 +22,8 @@ from ..optics.background import Light
 from ..representations import MovingSurfaces, TimeBasis
 from ..scan import Exposures, Scan
 from .elastic import Rest
-from .fit import MotionFit, motion_fit
-from .forecast import Halves
+from .fit import MotionFit, converged, motion_fit
+from .forecast import Halves, early_count, on_paths, places_of
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,9 @@ def angular_velocity(mesh: TriangleMesh, speed: np.ndarray) -> np.ndarray:
 
 def _in_field(points: np.ndarray, view: Views) -> np.ndarray:
     """Whether points [P, 3] [m] are on the detector of one view, [P] bool."""
-    seen = points @ view.rotations[0, :2].T - view.shifts[0]
+    lab = points @ view.rotations[0].T
+    wider = 1.0 if view.sources is None else view.sources[0] / (view.sources[0] + lab[:, 2:])
+    seen = wider * lab[:, :2] - view.shifts[0]
     rows, columns = view.shape
     return (np.abs(seen) <= 0.5 * np.array([columns, rows]) * view.pixel_sizes[0]).all(1)
 
@@ -194,16 +196,16 @@ def _table(bodies: MovingSurfaces, scan: Scan) -> dict[str, np.ndarray]:
     return {name: np.array([getattr(row, name) for row in rows]).reshape(times, -1) for name in columns()}
 
 
-LEAST = 8
-"""Times from which on halves of them still tell the paths of the whole."""
-USUAL = MotionFit()
-"""The usual options of fits to halves."""
+def half_fit(rest: Rest | None) -> MotionFit:
+    """The usual fit to a half: to its end. Of a known shape at rest it is short, for else halves agree on what both
+    have from that."""
+    return converged() if rest is None else MotionFit()
 
 
 def half_sets(
     train: Scan,
     bodies: MovingSurfaces,
-    how: MotionFit = USUAL,
+    how: MotionFit | None = None,
     seed: int = 0,
     light: Light | None = None,
     *,
@@ -215,13 +217,15 @@ def half_sets(
 
     Times before and after determine a path, so that each half gives nearly the path of the whole, with independent
     noise. If views are too few for shapes, the halves begin with perturbed shapes, as those of standard errors do
-    (`halves.astray`), but at the same middles. light: of the frames, which were divided by it; rest: the known shape of
-    the bodies; run: keeps both fits, and goes on with them. Errors: `InputError` for fewer than 8 times.
+    (`astray`), but at the same middles. how: as `half_fit` by default; light: of the frames, which were divided by it;
+    rest: the known shape of the bodies; run: keeps both fits, and goes on with them. Errors: `InputError` for fewer
+    times than tell the paths of halves.
     """
     times = train.instants
     require(
-        len(times) >= LEAST,
-        f"half-sets need frames of {LEAST} times or more, but there are {len(times)}; leave them with --no-half-sets.",
+        len(times) >= 2 * (count := bodies.basis.count),
+        f"half-sets of paths of {count} coefficients need frames of {2 * count} times or more, but there are "
+        f"{len(times)}; leave them with --no-half-sets.",
     )
     number = np.searchsorted(times, train.exposures.time)
     found, run = [], run or Run()
@@ -229,7 +233,7 @@ def half_sets(
         kept = np.flatnonzero(number % 2 == half)
         part = None if light is None else light.part(torch.from_numpy(kept))
         start = bodies if tell_shapes(train) else _shapes_astray(bodies, seed, 1 - 2 * half)
-        fit = motion_fit(train[kept], start, how, seed, part, rest)
+        fit = motion_fit(train[kept], start, how or half_fit(rest), seed, part, rest)
         kept_half = run.part(f"half-set {half}")
         kept_half.fit("half-sets", fit, on_record)
         kept_half.keep()
@@ -237,6 +241,22 @@ def half_sets(
         assert isinstance(one, MovingSurfaces)
         found.append(one.with_parameters({"coefficients": one.coefficients.detach()}))
     return found[0], found[1]
+
+
+def early_part(train: Scan, bodies: MovingSurfaces, times: np.ndarray) -> tuple[np.ndarray, MovingSurfaces]:
+    """Numbers of the frames of `train` in the first two thirds of `times` [T] s, and the `bodies` on paths of these
+    alone, of no more coefficients than half of them tell: what `half_sets` begins with, to test forecasts."""
+    first = early_count(len(times))
+    kept = np.flatnonzero(train.exposures.time < times[first - 1 : first + 1].mean())
+    known = train[kept].instants
+    degree = min(bodies.basis.degree, len(known) // 2 - 1)
+    basis = replace(
+        bodies.basis,
+        last=float(known[-1]),
+        degree=degree,
+        pieces=min(bodies.basis.pieces, len(known) // 2 - degree),
+    )
+    return kept, on_paths(bodies, known, places_of(bodies, known), basis)
 
 
 def _shapes_astray(bodies: MovingSurfaces, seed: int, side: int) -> MovingSurfaces:

@@ -20,7 +20,7 @@ from ..checks import MissingError, require
 from ..inference import Decision, Score, select
 from ..ranges import ManyOrNone, ranged
 from ..representations import MovingSurfaces
-from .forecast import Forecast, Halves, History, Model, Places, half_apart, places_of, told_by
+from .forecast import Forecast, Halves, History, Model, Places, half_apart, of_kept_volume, places_of, told_by
 
 ORDERS: dict[str, tuple[tuple[int, int], ...]] = {
     "dmd": ((2, 2), (3, 2), (4, 2), (4, 4), (6, 4)),
@@ -47,42 +47,51 @@ class ModesForecast:
 
     window: ManyOrNone = 0
     """Last times of the run that it sees (0: all)."""
+    keep_volume: bool = True
+    """Whether bodies keep the mean volume of the window."""
 
     def fit(self, history: History) -> Model:
         """What the past tells; `InputError` for fewer than `LEAST` times, `MissingError` without the extra."""
-        window = history.last(self.window)
+        window = self._windowed(history.times)
         require(
             len(window) >= LEAST,
             f"--by {self.kind} must see {LEAST} times at least, but the run has {len(window)}; take --by paths.",
         )
         one = WAYS[self.kind]
-        order = self.decided(history.bodies, window)
+        order = self.decided(history)
         chosen = next(each for each in ORDERS[self.kind] if str(each) == order.choice)
 
         def say(
             bodies: MovingSurfaces, times: np.ndarray, ahead: np.ndarray, halves: Halves | None
         ) -> tuple[Places, np.ndarray]:
-            found = _places(bodies, times, ahead, chosen, one)
+            def places(of: MovingSurfaces) -> Places:
+                found = _places(of, times, ahead, chosen, one)
+                return of_kept_volume(of, times, found) if self.keep_volume else found
+
             if halves is None:
-                return found, np.zeros((len(ahead), bodies.count))
-            return found, half_apart(bodies, *(_places(half, times, ahead, chosen, one) for half in halves))
+                return places(bodies), np.zeros((len(ahead), bodies.count))
+            return places(bodies), half_apart(bodies, *(places(half) for half in halves))
 
         def ahead(times: np.ndarray) -> Forecast:
-            return told_by(say, history.bodies, window, times, history.halves, MIDDLE)
+            return told_by(say, history, self._windowed, times, MIDDLE)
 
         return Model(ahead)
 
-    def decided(self, bodies: MovingSurfaces, window: np.ndarray) -> Decision:
-        """The order that tells the last third of the window best from what is before, over all bodies."""
-        early, late = np.split(window, [(2 * len(window) + 2) // 3])
-        truth = places_of(bodies, late)
+    def _windowed(self, times: np.ndarray) -> np.ndarray:
+        return times[-self.window :] if self.window else times
+
+    def decided(self, history: History) -> Decision:
+        """The order that tells the last third of the times best from what is before, over all bodies."""
+        before = history.before
+        early, late = self._windowed(before.times), history.times[len(before.times) :]
+        truth = places_of(history.bodies, late)
         one = WAYS[self.kind]
         kept = dict[str, Score]()
 
         def score(name: str, fold: int) -> Score:
             if name not in kept:
                 order = next(each for each in ORDERS[self.kind] if str(each) == name)
-                said = _places(bodies, early, late, order, one)
+                said = _places(before.bodies, early, late, order, one)
                 kept[name] = Score(np.array([[((a - b) ** 2).mean()] for a, b in zip(said, truth)]))
             return kept[name]
 

@@ -19,14 +19,13 @@ from ..methods.presets import SCHEMA
 from ..metrics import image_scores, intensity_range
 from ..motion.assimilate import carry_by_frames
 from ..motion.dynamics import DynamicsForecast, HybridForecast, window_of
-from ..motion.fit import MotionFit
 from ..motion.forecast import Forecast, Forecaster, Halves, History, PathForecast, decided
 from ..motion.learned import GraphForecast, read_dynamics
-from ..motion.measures import LEAST, half_sets
+from ..motion.measures import early_part, half_fit, half_sets
 from ..motion.modes import DmdForecast, SindyForecast
 from ..optics.background import Light
 from ..progress import FitProgress
-from ..ranges import Many, Seconds, checked_dataclass
+from ..ranges import Many, Positive, Seconds, checked_dataclass
 from ..representations import MovingSurfaces
 from ..scan import Scan
 from ..tables import read_rows, to_table
@@ -66,8 +65,8 @@ class ForecastOptions:
     """Whether paths, what was learnt and the mean compete, by the last third of the run's times."""
     half_sets: bool = True
     """Whether paths are fitted again to two halves of the times, which say what is believed of the motion."""
-    fit: MotionFit = field(default_factory=MotionFit)
-    """These fits."""
+    effort: Positive = 1.0
+    """Factor of the numbers of steps of these fits."""
 
     def __post_init__(self) -> None:
         require(
@@ -102,7 +101,9 @@ class Forecasted:
         """The numbers as a few lines of text."""
         step, last = self.forecast.times[0], self.forecast.times[-1]
         band = 1e6 * self.forecast.usual_band()
-        said = [f"standard error of surfaces: {band[0]:.3f} µm at {step:.4g} s, {band[-1]:.3f} µm at {last:.4g} s"]
+        said = ["standard error of surfaces: not told, for that needs half-sets"]
+        if np.isfinite(band).all():
+            said = [f"standard error of surfaces: {band[0]:.3f} µm at {step:.4g} s, {band[-1]:.3f} µm at {last:.4g} s"]
         if self.decision is not None:
             said.append(self.decision.line)
         if self.forecast.told:
@@ -131,9 +132,9 @@ def require_cells(run: Reconstruction, times: np.ndarray, options: ForecastOptio
     if isinstance(options.learned, GraphForecast) and options.learned.weights:
         read_dynamics(Path(options.learned.weights))
     if options.dynamics is not None:
-        window_of(tracked_bodies(run), times, options.ahead(times), options.dynamics)
+        window_of(History(tracked_bodies(run), times), options.ahead(times), options.dynamics)
     if options.learned is not None and not options.decides:
-        options.learned.fit(History(tracked_bodies(run), times, None)).ahead(options.ahead(times))
+        options.learned.fit(History(tracked_bodies(run), times)).ahead(options.ahead(times))
 
 
 def forecast(
@@ -155,15 +156,15 @@ def forecast(
     bodies, times = tracked_bodies(run), np.asarray(times, dtype=np.float64)
     ahead = options.ahead(times)
     slack = SAME_TIME * float(np.median(np.diff(times)))
-    known = scan[np.flatnonzero(scan.exposures.time <= times[-1] + slack)] if len(scan) else scan
+    within = (scan.exposures.time >= times[0] - slack) & (scan.exposures.time <= times[-1] + slack)
+    known = scan[np.flatnonzero(within)]
     last = np.flatnonzero(np.abs(scan.exposures.time - times[-1]) <= slack)
     require(len(last) > 0, f"the scan must have frames of the run's last time, {times[-1]:.6g} s, but it has none.")
-    halves = _halves(run, known, bodies, options, seed, Run(journal), on_progress) if options.half_sets else None
+    history = _history(run, known, times, options, seed, Run(journal), on_progress)
     on_progress("forecast", 0.0, {})
     decision, way = None, options.way
-    history = History(bodies, times, halves)
     if options.dynamics is not None and options.dynamics.frames:
-        window = window_of(bodies, times, ahead, options.dynamics, halves)
+        window = window_of(history, ahead, options.dynamics)
         found = carry_by_frames(window, _evened(run, known)[0], run.oversample)
     else:
         if options.decides:
@@ -172,6 +173,8 @@ def forecast(
             decision = replace(decision, by=decision.by + left_out)
             way = {one.kind: one for one in (options.model, *others)}[decision.choice]
         found = way.fit(history).ahead(ahead)
+    if history.halves is None:
+        found = replace(found, band=np.full_like(found.band, np.nan))
     exposures = scan.exposures[last].repeated(ahead)
     frames = render_object(found.bodies, exposures, run.oversample, bodies.backend)
     predicted = Scan(frames, exposures, np.zeros(len(frames), dtype=bool), {"forecast": way.kind})
@@ -180,6 +183,8 @@ def forecast(
 
 def _others(options: ForecastOptions, history: History, ahead: np.ndarray) -> tuple[list[Forecaster], str]:
     """What competes with paths, from simple to complex; and why the network does not, where it cannot look so far."""
+    if history.early is None:
+        return [], "; nothing else was asked, for that needs half-sets"
     mechanics: list[Forecaster] = [options.dynamics] if options.dynamics else []
     if options.learned is None:
         return mechanics, ""
@@ -218,7 +223,7 @@ def write_forecast(folder: RunFolder, run: Reconstruction, found: Forecasted) ->
     told = {"steps": 0, "times_s": said.times.tolist(), "bodies": said.bodies.count}
     folder.write_summary(summary_of(done, None, found.predicted) | told)
     write_scan(folder.path / FRAMES, found.predicted)
-    errors = ([f"{t:.7g}", k, f"{e:.4g}"] for t, band in zip(said.times, said.band) for k, e in enumerate(band))
+    errors = ([f"{t:.15g}", k, f"{e:.4g}"] for t, band in zip(said.times, said.band) for k, e in enumerate(band))
     write_rows(folder.path / TABLE, ["time_s", "body", "standard_error_m"], errors)
     band = [None if np.isnan(one) else float(one) for one in said.usual_band()]
     write_json(
@@ -250,7 +255,11 @@ def config_of(options: ForecastOptions, scan: Scan, run: dict[str, Any], seed: i
     return {
         "schema_version": SCHEMA,
         "method": {
-            **{"kind": options.kind, "of": run.get(RUN, ""), "forecast": options.way.kind},
+            **{
+                "kind": options.kind,
+                "of": run.get(RUN, ""),
+                "forecast": "auto" if options.decides else options.way.kind,
+            },
             **to_table(options),
         },
         "seed": seed,
@@ -261,26 +270,34 @@ def config_of(options: ForecastOptions, scan: Scan, run: dict[str, Any], seed: i
     }
 
 
-def _halves(
+def _history(
     run: Reconstruction,
     known: Scan,
-    bodies: MovingSurfaces,
+    times: np.ndarray,
     options: ForecastOptions,
     seed: int,
     kept: Run,
     on_progress: FitProgress,
-) -> Halves | None:
-    """Fits to halves of the training frames; None for too few times."""
-    train, part = _evened(run, known)
-    if len(train.instants) < LEAST:
-        return None
-    steps, before = options.fit.schedule.steps, [0.0, 0.0]
+) -> History:
+    """The run's bodies, with fits to halves of the training frames of all times and of the first two thirds of them;
+    without these for too few times, and where they are not asked for."""
+    bodies, (train, part) = tracked_bodies(run), _evened(run, known)
+    if not options.half_sets or len(train.instants) < 2 * bodies.basis.count:
+        return History(bodies, times)
+    fit, before = half_fit(run.rest), [0.0, 0.0]
+    fit = replace(fit, schedule=fit.schedule.with_effort(options.effort))
 
     def show(record: dict[str, float]) -> None:
         before[0], before[1] = before[0] + (record["step"] < before[1]), record["step"]
-        on_progress("half-sets", 0.5 * (before[0] + record["step"] / steps), record)
+        on_progress("half-sets", 0.25 * (before[0] + record["step"] / fit.schedule.steps), record)
 
-    return half_sets(train, bodies, options.fit, seed, part, rest=run.rest, run=kept, on_record=show)
+    def halves(scan: Scan, start: MovingSurfaces, light: Light | None, own: Run) -> Halves:
+        return half_sets(scan, start, fit, seed, light, rest=run.rest, run=own, on_record=show)
+
+    whole = halves(train, bodies, part, kept)
+    early, start = early_part(train, bodies, times)
+    light = part and part.part(torch.from_numpy(early))
+    return History(bodies, times, whole, halves(train[early], start, light, kept.part("early")))
 
 
 def _evened(run: Reconstruction, known: Scan) -> tuple[Scan, Light | None]:
