@@ -62,7 +62,7 @@ def write_glb(path: Path, bodies: Sequence[TriangleMesh], matter: Sequence[Matte
     """Write still bodies as a GLB file, one node a body, with δ and β (or µ and β) of the `matter` of each in the
     extras of its material."""
     require(len(bodies) > 0, "a GLB file needs at least one body.")
-    file = _Glb()
+    file = _Glb([])
     for body, filling in zip(bodies, matter):
         file.add(body.name, of.of_matter(filling), body.vertices, body.faces)
     file.write(path)
@@ -74,7 +74,7 @@ def write_moving_glb(path: Path, moving: MovingSurfaces, times: Sequence[float],
     Weights of B-splines add up to one, so that a path Σ w_k c_k is c_0 + Σ w_k (c_k - c_0): the differences are morph
     targets, and the animation gives their weights.
     """
-    file, constants = _Glb(), of.of_matter(moving.matter)
+    file, constants = _Glb([]), of.of_matter(moving.matter)
     shown = np.linspace(times[0], times[-1], FINE * (len(times) - 1) + 1)
     weights = moving.basis.weights(shown)[:, 1:]
     paths = moving.coefficients.detach().double().numpy() * moving.unit_length
@@ -91,7 +91,7 @@ def write_moving_glb(path: Path, moving: MovingSurfaces, times: Sequence[float],
 class _Glb:
     """A glTF document as it grows, and its bytes."""
 
-    constants: list[dict[str, float]] = field(default_factory=list)
+    constants: list[dict[str, float]]
     blob: bytearray = field(default_factory=bytearray)
     views: list[dict[str, Any]] = field(default_factory=list)
     accessors: list[dict[str, Any]] = field(default_factory=list)
