@@ -104,7 +104,7 @@ for n in range(4):
 PYTHON
 """
 SEEN = "--pixel-size 0.6e-6 --detector 32 32 --views 3 --test-every 0 --distance 0.02 --origin 0 0 0"
-KINDS = "bubbles cuvette crack keyhole jet break-up shock lattice fibres star channel"
+KINDS = "bubbles flotation cuvette crack keyhole jet break-up shock lattice fibres star channel"
 
 
 @dataclass(frozen=True)
