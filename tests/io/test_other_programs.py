@@ -127,6 +127,24 @@ def test_glb_has_a_node_a_body_in_metres_with_y_up(tmp_path):
         assert found.center_mass == pytest.approx(middle, abs=1e-10)
 
 
+def document(path: Path) -> dict:
+    """The JSON part of a GLB file."""
+    content = path.read_bytes()
+    return json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+
+
+def test_glb_says_what_each_body_is_of_and_when_it_moves(tmp_path):
+    other = Matter.one(-3e-7, -1e-10)
+    write_glb(tmp_path / "b.glb", bodies(), [other, MATTER])
+    said = document(tmp_path / "b.glb")
+    own = [said["materials"][mesh["primitives"][0]["material"]]["extras"] for mesh in said["meshes"]]
+    assert own == [{"delta": -3e-7, "beta": -1e-10}, {"delta": MATTER.delta, "beta": MATTER.beta}]
+    write_glb(tmp_path / "b.glb", bodies(), [MATTER] * 2)
+    assert len(document(tmp_path / "b.glb")["materials"]) == 1
+    write_moving_glb(tmp_path / "m.glb", moving(), [1e-6, 9e-6])
+    assert document(tmp_path / "m.glb")["animations"][0]["extras"] == {"first_s": 1e-6, "last_s": 9e-6}
+
+
 def moving() -> MovingSurfaces:
     """The balls on curved ways in two pieces of time."""
     shapes = bodies()
