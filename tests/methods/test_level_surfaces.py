@@ -156,6 +156,13 @@ def test_bodies_know_what_is_inside_them():
     assert volumes[LIQUID] - volumes[WALL] == pytest.approx(4 / 3 * np.pi * 5.0**3 * PIXEL**3, rel=0.08)
 
 
+def test_surfaces_on_both_sides_take_no_turns_with_a_volume(monkeypatch):
+    """Rounds of agreement bound matter to one side of its medium."""
+    monkeypatch.setattr(levels, "_cut_again", lambda *given: pytest.fail("a volume was made"))
+    task = Task(simulate(both_sides(), Exposures.of(VIEWS, 20.0, 0.03)), MaterialPrior.known(WALL, BUBBLE, LIQUID))
+    assert levels.in_turns(task, cut_on_both_sides(), Gaussians(), HOW) is cut_on_both_sides()
+
+
 def test_absorption_on_both_sides_lies_between_each_material_and_the_medium():
     known = KnownLevels((WALL, BUBBLE), DeltaBeta(WALL.delta, 0.0))
     assert known.occupancies == pytest.approx((-0.75, 1.0))

@@ -215,6 +215,11 @@ def test_the_command_line_tells_the_side():
     assert replace(told, contrast="below").prior(20.0) == told.prior(20.0)
     with pytest.raises(InputError, match="--contrast must be on the side of --material, but it is above"):
         replace(told, contrast="above").prior(20.0)
+    several = PriorOptions(material=("air", "glass"), medium="water")
+    for one in ("above", "below"):
+        with pytest.raises(InputError, match="--contrast must be on the side of --material"):
+            replace(several, contrast=one).prior(20.0)
+    assert replace(several, contrast="both").prior(20.0) == several.prior(20.0)
 
 
 @pytest.mark.parametrize(

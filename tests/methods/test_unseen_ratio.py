@@ -13,11 +13,12 @@ from holosplat.beamline.simulate import simulate
 from holosplat.checks import NoMatterError
 from holosplat.geometry import Views
 from holosplat.matter import DeltaBeta, MaterialPrior
-from holosplat.methods import Task
+from holosplat.methods import METHODS, Task
+from holosplat.methods.contrast import both_sides
 from holosplat.methods.cross_validation import FirstVolumes
 from holosplat.methods.illumination import prepared
-from holosplat.methods.levels import decide_ratio, ratio_of_one
-from holosplat.methods.method import first_of_task
+from holosplat.methods.levels import TrialFits, decide_ratio, ratio_of_one
+from holosplat.methods.method import first_of_task, one_material
 from holosplat.methods.uncertain import Determined
 from holosplat.optics.background import FLUX
 from holosplat.scan import Exposures, Scan
@@ -168,3 +169,21 @@ def test_matter_that_absorbs_in_unequal_flux_does_both():
     found = ratio_of_one(done, done.first)
     assert found.told
     assert 75 < found.value < 300  # 150
+
+
+def test_both_sides_and_fits_of_two_levels_have_the_ratio_that_was_decided(soft, monkeypatch):
+    """Neither looks for it again; and fits that compare hypotheses start on voxels of a pixel."""
+    place, asked = import_module("holosplat.methods.levels"), list[tuple[float, int]]()
+    task = Task(soft, MaterialPrior.unknown(1))
+    first = first_of_task(task).at_ratio(777.0)
+    asking = import_module("holosplat.methods.cross_validation")
+    monkeypatch.setattr(asking, "unseen_ratio", lambda one: pytest.fail("a ratio was asked"))
+    assert both_sides(first).material.ratio == pytest.approx(777.0)
+
+    def solved(method, fitted):
+        asked.append((one_material(fitted).ratio, method.gaussians.volume.refine))
+        raise NoMatterError
+
+    monkeypatch.setattr(place, "solve_stages", solved)
+    TrialFits(task, first, {"levels": METHODS["auto"].kinds["levels"]}).score("as measured", "levels", 0, two=True)
+    assert asked == [(pytest.approx(777.0), 1)]
