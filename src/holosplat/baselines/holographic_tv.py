@@ -267,7 +267,7 @@ def _settled(
     assert light.background is not None
     measured = (torch.from_numpy(scan.frames) * light.factor()).float()
     known = scan.known(measured)
-    samples = fringe_sampling(scan.exposures)
+    samples = fringe_sampling(scan.exposures, voxels=1)
     instrument = Instrument(scan.exposures, samples, backend=options.backend)
     best, least, first = None, float("inf"), light.noise
     for _ in range(1 + options.relit):
@@ -310,7 +310,7 @@ def _agree(
     unseen = unseen_rays(scan, beyond)
     unseen = None if unseen is None else refined(unseen.float(), refine).to(coarse.volume.device) > 0.5
     correction = Correction(scan, material, beyond[0], correlated(light))
-    finer = math.ceil(fringe_sampling(scan.exposures) / refine)
+    finer = math.ceil(fringe_sampling(scan.exposures, voxels=refine) / refine)
     instrument = Instrument(scan.exposures, refine * finer, backend=options.backend)
     frames = torch.from_numpy(scan.frames).to(instrument.device)
     gaps = None if scan.gaps is None else scan.gaps.to(instrument.device)

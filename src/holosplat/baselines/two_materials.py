@@ -208,7 +208,8 @@ def at_one_ratio(scan: Scan, shares: Shares, ratio: float, backend: Backend = "a
 
 def _lines(scan: Scan, values: Tensor, grid: Grid, backend: Backend) -> tuple[Instrument, Tensor]:
     """The instrument of a scan, and the line integrals [V, C, H, W] in metres that it wants of `values`."""
-    instrument = Instrument(scan.exposures, fringe_sampling(scan.exposures), backend=backend)
+    voxels = scan.views.finest / min(grid.voxel_size)
+    instrument = Instrument(scan.exposures, fringe_sampling(scan.exposures, voxels=voxels), backend=backend)
     if instrument.backend == "reference":
         return instrument, voxel_line_integrals(values, grid, instrument.views, step=1.0)
     return instrument, VoxelLines(grid, instrument.views, instrument.backend)(values.to(instrument.device))

@@ -106,7 +106,7 @@ class WhitenedFrames:
         self.train, self.material, self.beyond = train, material, beyond
         self.field = train.views.padded(beyond)
         """The views with the rows and columns beyond."""
-        self.instrument = Instrument(exposures, oversample or fringe_sampling(exposures), backend=backend)
+        self.instrument = Instrument(exposures, oversample or fringe_sampling(exposures, voxels=1), backend=backend)
         self.shape, self.pixel = (train.views.shape[0], train.views.shape[1]), train.views.finest
         frames, on = torch.from_numpy(train.frames), self.instrument.device
         self._amplitudes = frames.clamp_min(0).sqrt().to(on)

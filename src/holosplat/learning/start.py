@@ -212,7 +212,7 @@ def seen_in(scan: Scan, material: DeltaBeta) -> tuple[Tensor, Tensor, Tensor]:
     frames, optics = torch.from_numpy(scan.frames), scan.exposures.optical
     thickness = retrieved_thickness(frames, scan.exposures, material, scan.gaps)
     if scan.gaps is not None:
-        samples = fringe_sampling(optics)
+        samples = fringe_sampling(optics, voxels=1)
         frames = torch.where(
             scan.gaps, frames_of(Instrument(optics, samples), refined(thickness.float(), samples), material), frames
         )

@@ -47,9 +47,11 @@ HIDDEN = 2.0
 def predicted_frames(exposures: Exposures, obj: Object, oversample: int = 0) -> Tensor:
     """Frames [V, H, W] of `obj`, some views at a time to bound memory.
 
-    oversample: wave samples a pixel (0: as the first fringe needs).
+    oversample: wave samples a pixel (0: as the first fringe needs, or as voxels have it).
     """
-    samples, backend = oversample or fringe_sampling(exposures), obj.backend if isinstance(obj, Stored) else "cpu"
+    voxels = exposures.views.finest / min(obj.grid.voxel_size) if isinstance(obj, VoxelGrid) else math.inf
+    samples = oversample or fringe_sampling(exposures, voxels=voxels)
+    backend = obj.backend if isinstance(obj, Stored) else "cpu"
     frames = torch.empty(len(exposures), *exposures.views.shape)
     with torch.no_grad(), memory_kept():
         for views in alike(exposures, samples):

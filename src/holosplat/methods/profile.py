@@ -120,7 +120,7 @@ class Profile:
         self._noise = NoiseModel(white, noise.grain, noise.width)
         self._energy = self._scan.exposures.reference_energy
         self._beyond = (0, 0)
-        self._samples = max(fringe_sampling(self._exposed(c).exposures) for c in [nominal, *corners])
+        self._samples = max(fringe_sampling(self._exposed(c).exposures, voxels=1) for c in [nominal, *corners])
         with memory_kept():
             whole = self._volume(self.frames(nominal))
             self._beyond = margins_of(whole.grid, self._scan.views)

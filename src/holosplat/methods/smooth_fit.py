@@ -147,7 +147,7 @@ class SmoothFit:
     @property
     def oversample(self) -> int:
         """Wave samples a pixel."""
-        return fringe_sampling(self.plan.scan.exposures)
+        return fringe_sampling(self.plan.scan.exposures, voxels=1)
 
     @property
     def finished(self) -> bool:

@@ -120,7 +120,7 @@ class WaveModel:
         self.frames = frames.detach().to(device(self.backend))
         self.amplitude = self.frames.clamp_min(0).sqrt()
         self.missing = None if missing is None else missing.to(self.frames.device)
-        self.oversample = fringe_sampling(exposures)
+        self.oversample = fringe_sampling(exposures, voxels=1)
         self.margin = padding(exposures, self.oversample)
         views = exposures.views.padded(self.margin).refined(self.oversample)
         self.raster = Raster(views.shape, views.pixel_size)
