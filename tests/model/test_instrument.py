@@ -147,6 +147,8 @@ def test_oversample_from_the_fringe_width():
     assert resolving_oversample(taken[[0]], 4.0, 1) == 2
     assert resolving_oversample(taken[[0]], 4.0, 5) == 5
     assert (fringe_sampling(taken), fringe_sampling(taken[[0]]), fringe_sampling(taken, extra=1)) == (5, 1, 6)
+    assert [fringe_sampling(taken, voxels=n) for n in (0.5, 1, 2, 2.5, 7)] == [2, 2, 2, 3, 5]
+    assert fringe_sampling(taken, extra=1, voxels=1) == 3
 
 
 def test_simulate():

@@ -51,16 +51,15 @@ def fringe_sampling(exposures: Exposures, extra: int = 0, voxels: float = math.i
     """Samples per detector pixel that fits and what judges them work with; extra: further ones, for safety.
 
     Frames whose first fringe is narrower than `NARROWEST_FRINGE` pixels, or that have none, need one sample a pixel.
-    Matter on voxels, so many along a pixel's edge, has nothing finer than these, and intensities, as squares of waves,
-    have twice the band of the waves: two samples a voxel show all that it has, and more would show the edges of voxels
-    as fringes. Where the phase of a known wall jumps by more than half a wave from one pixel to the next, there are
-    twice as many.
+    Matter on voxels, so many along a pixel's edge, has nothing finer than these: one sample a voxel shows it, and two a
+    pixel the intensities, which have twice the band of waves. More would show the edges of voxels as fringes. Where the
+    phase of a known wall jumps by more than half a wave from one pixel to the next, there are twice as many.
     """
     steep = 2 if _is_steep(exposures) else 1
     exposures = exposures.optical
     seen = np.flatnonzero(fringes(exposures) >= NARROWEST_FRINGE * exposures.views.pixel_size)
     finest = resolving_oversample(exposures[seen], FRINGE_SAMPLES, at_least=1) if len(seen) else 1
-    return extra + steep * (min(finest, math.ceil(2 * voxels)) if math.isfinite(voxels) else finest)
+    return extra + steep * min(finest, max(2, finest if math.isinf(voxels) else math.ceil(voxels)))
 
 
 def _is_steep(exposures: Exposures) -> bool:
