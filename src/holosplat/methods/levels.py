@@ -69,7 +69,7 @@ def decide_matter(task: Task, methods: Mapping[MatterKind, Method] | None = None
         if methods is None or sure:
             return found
     for effort in (EFFORT, 1.0):
-        fits = TrialFits(task, first, {kind: method.with_effort(effort) for kind, method in methods.items()})
+        fits = TrialFits(task, first, methods, effort)
 
         def scored(name: str, fold: int, fits: TrialFits = fits) -> Score:
             return fits.score(name_of(first.taken), kind_of(name), fold, two=name == LEVELS[1])
@@ -116,13 +116,21 @@ class _FlatVolumes:
 class TrialFits:
     """Fits of the methods for either kind of matter to coarse frames, under hypotheses about light and noise.
 
-    They start from volumes on voxels of a pixel, as first ones are. Two levels alone need no ratio δ/β; else it is,
-    where nothing is known, the likeliest one, as in a run; before light is decided, that of the first volume.
+    They start from volumes on voxels of a pixel, as first ones are. Bodies take a part `effort` of their steps, and
+    smooth volumes all those of one round: after a fifth of them, what is left to be found passes for light. Two levels
+    alone need no ratio δ/β; else it is, where nothing is known, the likeliest one, as in a run; before light is
+    decided, that of the first volume.
     """
 
-    def __init__(self, task: Task, first: FirstVolumes, methods: Mapping[MatterKind, Method]) -> None:
+    def __init__(
+        self, task: Task, first: FirstVolumes, methods: Mapping[MatterKind, Method], effort: float = EFFORT
+    ) -> None:
         self._task, self._first = task, first
-        self._methods = {kind: with_entries(method, {"refine": 1}) for kind, method in methods.items()}
+        self._methods = {
+            kind: with_entries(method.with_effort(effort), {"refine": 1}) for kind, method in methods.items()
+        }
+        if "continuous" in methods:
+            self._methods["continuous"] = with_entries(methods["continuous"], {"refine": 1, "rounds": 1})
         self._trials = Trials(first, task.light)
 
     def score(self, name: str, kind: MatterKind, fold: int, two: bool = False) -> Score:
