@@ -27,6 +27,7 @@ from .cross_validation import BY_FISSION, EFFORT, FirstVolumes, predictions, wit
 from .method import Method, Task, first_of_task, solve_stages
 from .trials import WITHOUT, Hypothesis, Trial, Trials, accepted, hypothesis_of, name_of
 from .uncertain import Determined, likeliest_ratio
+from .volume import SmoothVolume
 
 STAGE = "levels or continuous matter"
 SHOWN = "matter in first volumes"
@@ -126,11 +127,12 @@ class TrialFits:
         self, task: Task, first: FirstVolumes, methods: Mapping[MatterKind, Method], effort: float = EFFORT
     ) -> None:
         self._task, self._first = task, first
-        self._methods = {
-            kind: with_entries(method.with_effort(effort), {"refine": 1}) for kind, method in methods.items()
-        }
-        if "continuous" in methods:
-            self._methods["continuous"] = with_entries(methods["continuous"], {"refine": 1, "rounds": 1})
+
+        def brief(method: Method) -> Method:
+            one = replace(method, rounds=1) if isinstance(method, SmoothVolume) else method.with_effort(effort)
+            return with_entries(one, {"refine": 1})
+
+        self._methods = {kind: brief(method) for kind, method in methods.items()}
         self._trials = Trials(first, task.light)
 
     def score(self, name: str, kind: MatterKind, fold: int, two: bool = False) -> Score:
