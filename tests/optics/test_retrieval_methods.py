@@ -95,9 +95,9 @@ def model_of(psf: float = 0.6, lambda_z: float = 12.0, ratio: float = 0.01, phot
 
 @pytest.mark.parametrize("lambda_z", [12.0, 0.9])
 def test_the_objectives_gradient(lambda_z):
-    """Against central differences, along random directions; at λz = 0.9/2 with three samples to the pixel."""
+    """Against central differences, along random directions; at λz = 0.9/2 with two samples to the pixel."""
     waves = model_of(lambda_z=lambda_z)
-    assert waves.oversample == (1 if lambda_z > 5 else 3)
+    assert waves.oversample == (1 if lambda_z > 5 else 2)
     weights = penalty_weights(waves, 1.0)
     generator = torch.Generator().manual_seed(3)
     phase = waves.phase + 0.2 * torch.rand(waves.phase.shape, dtype=DOUBLE, generator=generator)

@@ -200,9 +200,8 @@ def select(
     candidates: the null first, then from simple to complex; score: of a candidate on the unseen frames of a fold, kept
     by the caller; folds: how many there are. Folds are looked at one after another, as long as the candidate may win by
     those before; it is taken only if it wins over all of them, where the frames, and not their blocks, give the
-    standard error: frames differ by more than their parts do. Two folds are enough where their few frames make a gain
-    of practical size as sure (Student's t, 1908). by: how unseen frames came about; beside: other names that a
-    candidate must win against, too. surely, least: whether a gain must be sure, and the practical size that it
+    standard error: frames differ by more than their parts do. by: how unseen frames came about; beside: other names
+    that a candidate must win against, too. surely, least: whether a gain must be sure, and the practical size that it
     must have. Where another score has told that it is sure, its size is enough; where another has told its size
     (`least` is 0), it need only be sure.
     """
@@ -212,21 +211,12 @@ def select(
         rivals = (best, *(beside or {}).get(candidate, ()))
         found = _weakest(candidate, rivals, score, range(1), least)
         for last in range(1, folds):
-            if not found.open or (last > 1 and found.large and _sure(found, score, last)):
-                break
-            found = _weakest(candidate, rivals, score, range(last + 1), least)
+            if found.open:
+                found = _weakest(candidate, rivals, score, range(last + 1), least)
         compared.append(found)
         if found.wins or (found.large and not surely):
             best = candidate
     return Decision(name, best, by, tuple(compared), round(time.perf_counter() - began, 2))
-
-
-def _sure(found: Compared, score: Callable[[str, int], Score], folds: int) -> bool:
-    """Whether the frames of so many folds are enough for a gain to be as sure as `ERRORS` of many are."""
-    from scipy.special import ndtr, stdtrit
-
-    frames = sum(score(found.name, fold).frames for fold in range(folds))
-    return found.gain > found.error * float(stdtrit(frames - 1, ndtr(ERRORS)))
 
 
 def _weakest(
