@@ -20,7 +20,7 @@ from .sentence import put, say, tell_frames
 if TYPE_CHECKING:
     import numpy as np
 
-    from ..align import AlignedViews, Calibrated, PoseOptions, PosePrior
+    from ..align import AlignedViews, PoseOptions, PosePrior
     from ..mesh import TriangleMesh
     from ..scan import Exposures
 
@@ -271,6 +271,7 @@ def calibrate(
     from ..align import CalibrationOptions
     from ..align import calibrate as find
     from ..io.atomic import require_writable
+    from ..io.beams import Beams, write_beams
     from ..io.formats import read_frames
     from ..matter import MaterialPrior
 
@@ -284,13 +285,7 @@ def calibrate(
         options, light = CalibrationOptions(unknown.prior(), unknown.uncertain_pixel), illumination.options()
         found = find(measured, MaterialPrior.known(material), shape, options, light=light, on_progress=bar.show)
     put(found.lines())
-    _write_beams(out, scan, found)
-    say(f"wrote {out}: the geometry of {len(measured)} beams, for --exposures")
-
-
-def _write_beams(out: Path, scan: Path, found: Calibrated) -> None:
-    from ..io.beams import Beams, write_beams
-
     beams = Beams.of(found.exposures, found.errors, {"scan": str(scan), "calibrated": found.lines()[0]})
     size, doubt = found.pixel_size
     write_beams(out, beams.with_pixel_size(size) if doubt else beams)
+    say(f"wrote {out}: the geometry of {len(measured)} beams, for --exposures")

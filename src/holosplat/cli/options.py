@@ -72,21 +72,27 @@ class MeshOptions:
 
 
 @checked_dataclass
-class MaterialOptions:
-    """What fills the meshes."""
+class OneMaterial:
+    """One material, and what surrounds it."""
 
     material: str | None = None
-    """Formula, or a name (holosplat materials lists them); without --materials, haemoglobin."""
+    """Formula, or a name (holosplat materials lists them)."""
     density: Grams | None = None
     """Its density [g/cm³]; a named one has its own."""
     medium: str | None = None
-    """Formula or name of what surrounds the meshes; none means vacuum."""
+    """Formula or name of what surrounds it; none means vacuum."""
     medium_density: Grams | None = None
     """The medium's density [g/cm³]."""
+
+
+@checked_dataclass
+class MaterialOptions(OneMaterial):
+    """What fills the meshes."""
+
     index: Index | None = None
     """Or, of light: their refractive index, of matter that does not absorb, in a medium of --medium-index."""
     materials: Path | None = None
-    """JSON or TOML table of materials by mesh file name, for scenes of several."""
+    """JSON or TOML table of materials by mesh file name, for scenes of several (default: haemoglobin in all)."""
 
     def filling(self, medium_index: float | None = None) -> Filling:
         """The materials that the options name, in a medium of so large a refractive index for light."""
@@ -138,8 +144,7 @@ class BeamlineOptions(Directions):
     """One view in so many is held out of the fit (0: none)."""
 
     def told(self) -> BeamlineOptions:
-        """The same with one photon energy, and what the file of --exposures says; `InputError` for options that say it
-        twice."""
+        """The same with one photon energy and what --exposures says; `InputError` for options that say it twice."""
         once = not self.distances or (self.distance == BeamlineOptions.distance and self.exposures is None)
         require(once, "--distances says how far the detector is; leave --distance, or --exposures.")
         told = None if self.energy_kev == BeamlineOptions.energy_kev else self.energy_kev
@@ -262,10 +267,6 @@ class MisalignmentOptions:
 
         errors = (self.misalign_shift, self.misalign_rotation, self.misalign_distance)
         return Misalignment(*errors, self.misalign_seed, self.misalign_magnification)
-
-    def facts(self) -> dict[str, str]:
-        """What the file of the true exposures says of them."""
-        return {name: f"{value:g}" for name, value in vars(self).items()}
 
 
 @checked_dataclass

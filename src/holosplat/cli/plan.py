@@ -5,15 +5,16 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 from tyro.conf import arg
 
 from ..checks import in_range, require
 from ..frames import evenly
-from ..planning.contrast import Setup
-from ..planning.plan import Motion, Plan, Recording, Sampling, Storage, Survey, Waves, experiment
+from ..mesh import TriangleMesh
+from ..planning.contrast import Setup, Subject
+from ..planning.plan import Motion, Plan, Recording, Sampling, Storage, Survey, experiment, survey
 from ..planning.plan import plan as make_plan
 from ..progress import Advance
 from ..ranges import Grams, Many, Metres, Positive, Signed, Small, checked_dataclass
@@ -22,11 +23,6 @@ from .options import MaterialOptions
 from .places import Output
 from .progress import ProgressBar
 from .sentence import say
-
-if TYPE_CHECKING:
-    from ..mesh import TriangleMesh
-    from ..planning.contrast import Subject
-    from ..workflows.rehearsal import Rehearsal
 
 CELL_DIAMETER = 8e-6
 LEVEL = 4
@@ -61,7 +57,6 @@ class ObjectOptions:
     def subject(self) -> Subject:
         """The object that the options name."""
         from ..materials import Transparent
-        from ..planning.contrast import Subject
 
         filling = MaterialOptions(self.material, self.density, self.medium, self.medium_density).filling()
         assert filling.material is not None
@@ -70,7 +65,6 @@ class ObjectOptions:
 
     def _shape(self) -> TriangleMesh:
         from ..io.vtk import read_meshes
-        from ..mesh import TriangleMesh
         from ..specimens.red_cells import evans_fung_cell, icosphere
         from ..specimens.repair import closed
 
@@ -145,10 +139,6 @@ class RangeOptions:
 
     def run(self, subject: Subject, setup: Setup, photons: float, on_progress: Advance) -> Survey:
         """The survey of the ranges: distances in equal ratios, energies in equal steps."""
-        import numpy as np
-
-        from ..planning.plan import survey
-
         distances, energies = [setup.distance], [setup.energy_kev]
         if self.distance_range is not None:
             distances = np.geomspace(*self.distance_range, self.points[0])
@@ -181,7 +171,17 @@ def plan(
     if ranges.wanted:
         with ProgressBar() as bar:
             surveyed = ranges.run(subject, beam, record.photons_per_pixel, bar.of("surveying"))
-    foreseen = None if times is None else _foreseen(subject, beam, record, times)
+    foreseen = None
+    if times is not None:
+        from ..matter import MaterialPrior
+        from ..methods import METHODS
+        from ..workflows.preconditions import FEWEST_COLUMNS
+        from ..workflows.rehearsal import SIDE, foresee
+
+        scene, exposures, photons = experiment(subject, beam, record, SIDE, FEWEST_COLUMNS)
+        prior, method = MaterialPrior.known(subject.contrast(beam.energy_kev)), METHODS["holographic-tv"]
+        with ProgressBar() as bar:
+            foreseen = foresee(scene, exposures, photons, prior, method, times=times, on_progress=bar.show)
     if as_json:
         found = _as_dict(what.name(), beam, record, planned, surveyed)
         found |= {} if foreseen is None else {"rehearsal": foreseen.as_dict()}
@@ -195,19 +195,6 @@ def plan(
     if surveyed is not None and ranges.out is not None:
         _write(ranges.out, surveyed)
         say(f"wrote {ranges.out} and {ranges.out.with_suffix('.csv')}")
-
-
-def _foreseen(subject: Subject, setup: Setup, recording: Recording, times: int) -> Rehearsal:
-    from ..matter import MaterialPrior
-    from ..methods import METHODS
-    from ..workflows.preconditions import FEWEST_COLUMNS
-    from ..workflows.rehearsal import SIDE, foresee
-
-    scene, exposures, photons = experiment(subject, setup, recording, SIDE, FEWEST_COLUMNS)
-    prior = MaterialPrior.known(subject.contrast(setup.energy_kev))
-    with ProgressBar() as bar:
-        method = METHODS["holographic-tv"]
-        return foresee(scene, exposures, photons, prior, method, times=times, on_progress=bar.show)
 
 
 def _as_dict(name: str, setup: Setup, recording: Recording, planned: Plan, surveyed: Survey | None) -> dict[str, Any]:
@@ -270,12 +257,14 @@ Group = tuple[str, list[tuple[str, str]]]
 
 def _waves(plan: Plan) -> Group:
     waves = plan.waves
+    fringe = f"{_length(waves.fringe)}, {waves.fringe_px:.3g} px" if waves.fringe else "none: absorption alone"
+    fringe += " (finer than two pixels: blurred)" if 0 < waves.fringe_px < 2 else ""
     absorbed = f"{in_percent(abs(waves.absorption))} {'more' if waves.absorption >= 0 else 'less'} than the medium"
     rows = [
         ("Δδ, Δβ", f"{waves.delta:.3g}, {waves.beta:.3g}"),
         ("Fresnel number, object's radius", f"{waves.fresnel_object:.3g}"),
         ("Fresnel number, pixel", f"{waves.fresnel_pixel:.3g}"),
-        ("first fringe √(λz)", _fringe(waves)),
+        ("first fringe √(λz)", fringe),
         ("largest phase shift", f"{waves.phase:.3g} rad"),
         ("largest absorption", absorbed),
         ("contrast, least to greatest", f"{waves.contrast_low:+.3g} to {waves.contrast_high:+.3g}"),
@@ -283,13 +272,6 @@ def _waves(plan: Plan) -> Group:
         ("90 % of the signal lies within", _length(waves.spread)),
     ]
     return "one object", rows
-
-
-def _fringe(waves: Waves) -> str:
-    if waves.fringe == 0:
-        return "none: absorption alone"
-    blurred = " (finer than two pixels: blurred)" if waves.fringe_px < 2 else ""
-    return f"{_length(waves.fringe)}, {waves.fringe_px:.3g} px{blurred}"
 
 
 def _detection(recording: Recording, plan: Plan) -> Group:

@@ -14,6 +14,8 @@ from ..checks import require
 from ..io.formats import read_frames
 from ..io.reading import Reading
 from ..matter import MaterialPrior
+from ..planning.acts import of_each_time, one_time, times_of
+from ..planning.scan_facts import smaller
 from ..ranges import Jobs, Seed, checked_dataclass
 from ..series.collect import collect as join
 from ..series.folder import Row, SeriesFolder, line_of, table_of, time_left, verdict_of
@@ -26,7 +28,7 @@ from ..workflows.verdict import some
 from .light import RunLightFlags
 from .options import MethodOptions, PriorOptions
 from .places import Kept, Output, with_checked_arguments
-from .sentence import interruptible, put, say, tell_each_time
+from .sentence import interruptible, put, say, tell
 from .track import BodyFlags, MotionFlags
 
 if TYPE_CHECKING:
@@ -243,16 +245,18 @@ def reconstruct_each(
     reading: Reading,
     resume: bool,
 ) -> None:
-    """Make the series of all times of `scan` in the folder `out`, in this process, and its table and page.
-
-    It is what `series plan`, `run` and `collect` make of it, as one task. resume: go on with a folder that was begun.
-    Errors: `InputError` for a folder that is not of this, and what `plan_series` refuses.
-    """
+    """Make the series of all times of `scan` in the folder `out` as one task, with its table and page; resume: go on
+    with a folder that was begun. Errors: `InputError` for another folder, and as of `plan_series`."""
     reading = replace(reading, part=replace(reading.part, time_frame=None))
     every = plan_series([scan], settings, prior, reading, Cut())
     planned = replace(every, cut=Cut(window=len(every.moments())))
-    seen, method, matter = read_frames(scan, reading), settings.method, settings.matter
-    tell_each_time(seen.exposures[~seen.is_test], out, method, matter)
+    measured, method, matter = read_frames(scan, reading), settings.method, settings.matter
+    seen = measured.exposures[~measured.is_test]
+    needs = of_each_time(seen, method, matter) if len(seen) else None
+    if needs is not None:
+        count = times_of(seen)
+        others = ((how, one.times(count)) for how, one in smaller(one_time(seen), method, matter))
+        tell(f"{count} times", needs, out, others)
     folder = SeriesFolder(out)
     if resume and out.exists():
         require(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -23,7 +23,7 @@ from .options import (
 )
 from .places import Output
 from .progress import ProgressBar
-from .sentence import say, tell_simulation
+from .sentence import say, tell
 from .specimen import NO_SPECTRUM, SourceOptions, SpecimenOptions
 
 if TYPE_CHECKING:
@@ -32,15 +32,10 @@ if TYPE_CHECKING:
     from ..beamline.series import Timing
     from ..beamline.simulate import Filling
     from ..geometry import Views
-    from ..scan import Exposures
-    from ..specimens.carried import CarriedScene
-    from ..specimens.continuous import ContinuousScene
-    from ..specimens.drawn import ChangingScene, Drawn
-    from ..specimens.rods import RodScene
-    from ..specimens.scene import MeshScene, MeshSeries, VoxelScene
+    from ..specimens.drawn import Drawn
+    from ..specimens.scene import MeshScene, MeshSeries
     from ..volume import Object
-
-    Still = MeshScene | ContinuousScene | VoxelScene | CarriedScene | RodScene | ChangingScene
+    from .specimen import Still
 
 
 @checked_dataclass
@@ -87,8 +82,7 @@ class TruthOptions:
     def of_regions(
         self, regions: Mapping[str, Object], volumes: list[tuple[Path, int]]
     ) -> dict[Path, tuple[Object, int]]:
-        """Each volume file of a named part to write beside those of all matter, the part, and the number of its time;
-        `InputError` where they are wanted of none."""
+        """The file of each named part of matter, the part, and its time's number; `InputError` without such parts."""
         if not self.truth_regions:
             return {}
         require(len(regions) > 0, "--truth-regions is of matter that may fill the field (--specimen); leave it.")
@@ -114,10 +108,8 @@ MOST_FRAMES = 10**6
 
 @dataclass(frozen=True)
 class _Specimen:
-    """What is imaged, and at which times [T] of the frames [s].
-
-    facts: what the scan file says of it; regions: its named parts; goes_on: whether it goes on beyond the field.
-    """
+    """What is imaged at which times [T] of frames [s]; facts for the scan file; regions: named parts; goes_on: beyond
+    the field."""
 
     matter: Still | MeshSeries
     times: np.ndarray
@@ -161,6 +153,8 @@ def simulate(
 
     from ..backends import resolve
     from ..beamline.series import held_out
+    from ..io.nxtomo import scan_writer
+    from ..planning.acts import of_simulation
 
     truth.require_usable(out)
     resolve(experiment.backend)  # before anything is read
@@ -184,9 +178,21 @@ def simulate(
             require(source.light(beamline.energy_kev) is None, NO_SPECTRUM)
             specimen = _still(generated, times, imaged, files, beamline)
     times = specimen.times
-    _require_few(len(views) * len(times))
+    count = len(views) * len(times)
+    require(
+        count <= MOST_FRAMES,
+        f"views and times must make at most {MOST_FRAMES} frames, but they make {count}; take fewer of --views or "
+        "--frames.",
+    )
     how = replace(experiment.noise.simulation(motion.shutter(), experiment.light), backend=experiment.backend)
-    _say_of_missing_field(specimen, true_views.views, beamline.pixel_size)
+    missing = specimen.matter.missing_field(true_views.views)
+    if specimen.goes_on:
+        say("the matter, or its medium, goes on beyond the field of view; the frames are made with it")
+    elif missing > 0:
+        say(
+            f"warning: the scene reaches {1e6 * missing:.3g} µm ({missing / beamline.pixel_size:.3g} pixels) beyond "
+            "the detector in at least one view; enlarge --detector, or move --origin."
+        )
     of_poses = motion.hold_out == "views"
     split = beamline.split(len(views)) if of_poses else replace(beamline, distances=()).split(len(times))
     is_test = held_out(split, len(views), len(times), motion.hold_out)
@@ -196,12 +202,17 @@ def simulate(
         facts["material"] = named.material
     regions, targets = truth.of_regions(specimen.regions, volumes), [(out, nominal, facts)]
     if truth.true_exposures:
-        targets.append((truth.true_exposures, true, facts | experiment.misalignment.facts()))
-    tell_simulation(true_views, out, how.samples(true_views), len(true))
+        errors = {name: f"{value:g}" for name, value in vars(experiment.misalignment).items()}
+        targets.append((truth.true_exposures, true, facts | errors))
+    tell("the simulation", of_simulation(true_views, how.samples(true_views), len(true)), out)
     if truth.write_mesh(specimen.matter):
         say(f"wrote {truth.truth_mesh}: the true surfaces")
-    with ProgressBar() as bar:
-        _write_frames(targets, is_test, source.frames(specimen.matter, filled, true, how), bar)
+    with ProgressBar() as bar, ExitStack() as stack:
+        writers = [stack.enter_context(scan_writer(path, e, is_test, facts)) for path, e, facts in targets]
+        for n, frame in enumerate(source.frames(specimen.matter, filled, true, how)):
+            for add in writers:
+                add(frame)
+            bar.show("simulating views", (n + 1) / len(is_test), {})
     text = "{} frames of {} × {} pixels, {} of them held out".format(len(true), *beamline.detector, is_test.sum())
     say(f"wrote {out}: {text}{f', at {len(times)} times from {len(views)} views' if motion.frame_rate else ''}")
     if truth.true_exposures:
@@ -272,42 +283,6 @@ def _still(
     found = imaged.generated.in_field(beamline)
     goes_on = found is not None and found.goes_on
     return _Specimen(generated.scene, times, said | {"specimen_drawn": generated.text}, generated.regions, goes_on)
-
-
-def _require_few(frames: int) -> None:
-    require(
-        frames <= MOST_FRAMES,
-        f"views and times must make at most {MOST_FRAMES} frames, but they make {frames}; take fewer of --views or "
-        "--frames.",
-    )
-
-
-def _say_of_missing_field(specimen: _Specimen, views: Views, pixel_size: float) -> None:
-    missing = specimen.matter.missing_field(views)
-    if specimen.goes_on:
-        say("the matter, or its medium, goes on beyond the field of view; the frames are made with it")
-    elif missing > 0:
-        say(
-            f"warning: the scene reaches {1e6 * missing:.3g} µm ({missing / pixel_size:.3g} pixels) beyond "
-            "the detector in at least one view; enlarge --detector, or move --origin."
-        )
-
-
-def _write_frames(
-    targets: list[tuple[Path, Exposures, dict[str, str]]],
-    is_test: np.ndarray,
-    frames: Iterator[np.ndarray],
-    bar: ProgressBar,
-) -> None:
-    """Every frame to all `targets`, as it comes."""
-    from ..io.nxtomo import scan_writer
-
-    with ExitStack() as stack:
-        writers = [stack.enter_context(scan_writer(path, e, is_test, facts)) for path, e, facts in targets]
-        for n, frame in enumerate(frames):
-            for add in writers:
-                add(frame)
-            bar.show("simulating views", (n + 1) / len(is_test), {})
 
 
 def _write_truth(path: Path, matter: Object, views: Views) -> None:

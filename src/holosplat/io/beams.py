@@ -145,10 +145,8 @@ class Beams:
         return scan.taken(self.on(scan.exposures))
 
     def on(self, planned: Exposures) -> Exposures:
-        """These exposures in the place of those `planned`: one a frame, or one a frame of every time.
-
-        Errors: `InputError` for another number of frames.
-        """
+        """These exposures in place of those `planned`, one a frame, or a frame of every time; `InputError` for another
+        number."""
         index = self._index(planned.time)
         pixels, metres, in_pixels = (self.said(name) for name in ("pixel_size_m", "shift_m", "shift_px"))
         sizes = planned.views.pixel_sizes if pixels is None else pixels[index]

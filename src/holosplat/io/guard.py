@@ -22,8 +22,7 @@ from ..checks import InputError, require, require_regular
 from .room import machine_memory
 
 RATIO = 1100
-"""Declared bytes over those of a file, at most: deflate, the densest that readers know, makes zeros 1032 times smaller.
-"""
+"""Declared bytes over those of a file, at most: deflate makes zeros 1032 times smaller."""
 SMALL = 1 << 26
 """Bytes that any file may declare."""
 DEEPEST = 64
@@ -244,8 +243,7 @@ def _headers(content: bytes, size: int) -> Iterator[bytes]:
 
 
 def cells_fault(data: Any) -> str:
-    """The fault in the cells of a vtkPolyData or vtkUnstructuredGrid: corners that are no points, or too few or too
-    many corners for the cell's type."""
+    """Cells of a vtkPolyData or vtkUnstructuredGrid with corners that are no points, or of a wrong number."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     points = data.GetNumberOfPoints()

@@ -97,35 +97,48 @@ def require_own(file: h5py.File, path: Path) -> None:
 
 def _others(file: h5py.File, path: Path, allowed: bool) -> list[Path]:
     """The HDF5 files that an open one refers to, once all else of it is in order."""
-    size, found = path.stat().st_size, list[Path]()
+    found: list[Path] = []
     for name, kind in _links(file, path):
-        label = f"{path}: /{name.decode(errors='replace')}"
+        inner = f"/{name.decode(errors='replace')}"
         require(name.count(b"/") < DEEPEST, f"{path} must not be nested more than {DEEPEST} deep, but it is.")
         if kind == h5l.TYPE_EXTERNAL:
-            require(allowed, _refers(path, name, "is a link to another file"))
-            found += linked(path, label, file.id.links.get_val(name)[0])
+            require(allowed, _refers(path, inner, "is a link to another file"))
+            linked = os.fsdecode(file.id.links.get_val(name)[0])
+            found += _required(path, f"{path}: {inner}", [linked], LINKS)
         elif kind == h5l.TYPE_HARD and h5o.get_info(file.id, name).type == h5o.TYPE_DATASET:
-            found += _dataset_files(h5d.open(file.id, name), path, name, allowed, size)
+            found += _dataset_files(h5d.open(file.id, name), path, inner, allowed)
     return found
 
 
-def _dataset_files(dataset: h5d.DatasetID, path: Path, name: bytes, allowed: bool, size: int) -> list[Path]:
-    """The HDF5 files that a dataset of the file `path` refers to, once its values are in order."""
-    label, plan = f"{path}: /{name.decode(errors='replace')}", dataset.get_create_plist()
+def _dataset_files(dataset: h5d.DatasetID, path: Path, inner: str, allowed: bool) -> list[Path]:
+    """The HDF5 files that the dataset `inner` of the file `path` refers to, once its values are in order."""
+    label, plan, size = f"{path}: {inner}", dataset.get_create_plist(), path.stat().st_size
     unknown_filters(plan)  # loads those that are installed; others are named where values are read
     if dataset.shape is None:  # a null dataspace holds nothing, which whoever wants a value says
         return []
     declared = math.prod(dataset.shape, start=dataset.get_type().get_size())
-    virtual, external = plan.get_layout() == h5d.VIRTUAL, plan.get_external_count() > 0
-    others = virtual and any(plan.get_virtual_filename(n) != "." for n in range(plan.get_virtual_count()))
-    require(allowed or not (others or external), _refers(path, name, "has its values in another file"))
+    virtual = plan.get_layout() == h5d.VIRTUAL
+    sources = [plan.get_virtual_filename(n) for n in range(plan.get_virtual_count())] if virtual else []
+    names = [name for name in dict.fromkeys(sources) if name != "."]
+    storage = [plan.get_external(n) for n in range(plan.get_external_count())]
+    require(allowed or not (names or storage), _refers(path, inner, "has its values in another file"))
     if virtual:
-        return virtual_sources(path, label, plan, declared)
-    if external:
-        require_external(path, label, plan, declared)
+        found = _required(path, label, names, VIRTUAL)
+        require_declared(label, declared, sum(place.stat().st_size for place in found) + size)
+        return found
+    if storage:
+        held = 0
+        for name, offset, part in storage:
+            (first, *_) = _required(path, label, [os.fsdecode(name)], EXTERNAL)
+            held += max(0, min(part, first.stat().st_size - offset))
+        require(
+            declared <= held,
+            f"{label} declares {declared:.3g} bytes of values, but the files beside it hold {held:.3g}; they are cut "
+            "short, or it is no honest file.",
+        )
     else:
         require_declared(label, declared, size)
-        require_chunks(dataset, label, size)
+        _require_chunks(dataset, label, size)
     return []
 
 
@@ -135,11 +148,8 @@ def is_vouched(path: Path) -> bool:
     return any(whole == known or known in whole.parents for known in _vouched)
 
 
-def _refers(path: Path, name: bytes, what: str) -> str:
-    return (
-        f"{path} must hold its own values, but /{name.decode(errors='replace')} {what}; if you trust both, add "
-        "--allow-external."
-    )
+def _refers(path: Path, inner: str, what: str) -> str:
+    return f"{path} must hold its own values, but {inner} {what}; if you trust both, add --allow-external."
 
 
 def _links(file: h5py.File, path: Path) -> Iterator[tuple[bytes, int]]:
@@ -164,9 +174,8 @@ PIECE = 1 << 20
 """Bytes that are unpacked at a time."""
 
 
-def require_chunks(dataset: h5d.DatasetID, label: str, size: int) -> None:
-    """`InputError` if a chunk of `dataset`, in a file of `size` bytes, declares more than it can hold, or unpacks to
-    more than it declares."""
+def _require_chunks(dataset: h5d.DatasetID, label: str, size: int) -> None:
+    """`InputError` if a chunk of `dataset`, in a file of `size` bytes, declares or unpacks to too much."""
     plan = dataset.get_create_plist()
     if plan.get_layout() != h5d.CHUNKED:
         return
@@ -189,16 +198,8 @@ def require_chunks(dataset: h5d.DatasetID, label: str, size: int) -> None:
 
 def chunks_of(dataset: h5d.DatasetID) -> Iterator[tuple[tuple[int, ...], int, int]]:
     """Offset, filters that were left out (a bit each) and stored bytes of each chunk."""
-    if not hasattr(dataset, "chunk_iter"):  # HDF5 before 1.14
-        infos = (dataset.get_chunk_info(number) for number in range(dataset.get_num_chunks()))
-        yield from ((info.chunk_offset, info.filter_mask, info.size) for info in infos)
-        return
     found: list[tuple[tuple[int, ...], int, int]] = []
-
-    def take(info: h5d.StoreInfo) -> None:
-        found.append((info.chunk_offset, info.filter_mask, info.size))
-
-    dataset.chunk_iter(take)
+    dataset.chunk_iter(lambda info: found.append((info.chunk_offset, info.filter_mask, info.size)))
     yield from found
 
 
@@ -250,38 +251,9 @@ SERIES = re.compile(r"%\d*b")
 """Within the name of a virtual dataset's source: the number of a block."""
 
 
-def linked(path: Path, label: str, name: bytes) -> list[Path]:
-    """The files that a link of the file `path` to a file `name` may lead to; `InputError` where there is none, or it is
-    no regular file."""
-    return _required(path, label, [os.fsdecode(name)], LINKS)
-
-
-def virtual_sources(path: Path, label: str, plan: h5p.PropDCID, declared: int) -> list[Path]:
-    """The files of which a virtual dataset of `declared` bytes is put together, apart from `path` itself."""
-    names = dict.fromkeys(plan.get_virtual_filename(number) for number in range(plan.get_virtual_count()))
-    found = _required(path, label, [name for name in names if name != "."], VIRTUAL)
-    held = sum(place.stat().st_size for place in found) + path.stat().st_size
-    require_declared(label, declared, held)
-    return found
-
-
 def virtual_places(path: Path, name: str) -> list[Path]:
     """The files that HDF5 may open for the source `name` of a virtual dataset of the file `path`."""
     return [place for place in _places(path, name, VIRTUAL) if place.is_file()]
-
-
-def require_external(path: Path, label: str, plan: h5p.PropDCID, declared: int) -> None:
-    """`InputError` unless the files of a dataset with external storage are regular, and hold what it declares."""
-    parts = [plan.get_external(number) for number in range(plan.get_external_count())]
-    held = 0
-    for name, offset, size in parts:
-        (first, *_) = _required(path, label, [os.fsdecode(name)], EXTERNAL)
-        held += max(0, min(size, first.stat().st_size - offset))
-    require(
-        declared <= held,
-        f"{label} declares {declared:.3g} bytes of values, but the files beside it hold {held:.3g}; they are cut "
-        "short, or it is no honest file.",
-    )
 
 
 def _required(path: Path, label: str, names: list[str], prefix: str) -> list[Path]:
@@ -300,8 +272,7 @@ def _required(path: Path, label: str, names: list[str], prefix: str) -> list[Pat
 
 
 def _places(path: Path, name: str, prefix: str) -> Iterator[Path]:
-    """Where HDF5 looks for the file `name` of `path`: as it is named, in folders of the environment, beside `path`, and
-    beside what `path` is a link to (`H5F_prefix_open_file`)."""
+    """Where HDF5 looks for the file `name` of `path` (`H5F_prefix_open_file`)."""
     given, short = Path(name), Path(Path(name).name)
     below = short if given.is_absolute() else given
     folders = [Path(part) for part in os.environ.get(prefix, "").split(os.pathsep) if part]

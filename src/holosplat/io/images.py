@@ -22,10 +22,10 @@ from ..checks import InputError, finite, note, require, require_regular
 from ..scan import Scan
 from .angles import angles_of, in_order, read_angles, tell_angles
 from .atomic import atomic_folder, write_json
-from .leftovers import is_hidden
+from .lock import is_hidden
 from .raw_file import DARK, FLAT, NOTHING, PROJECTION, RAW_TAKES, Loader, ScanFile
 from .stacks import IMAGES, ImageStack, all_images, images_in, stack_of
-from .stored_frames import light_frames, reader
+from .stored_frames import light_frames, raw_loader
 from .table import Table, beam_table, exposure_table, read_exposures
 
 FIELDS = {FLAT: "flat|white|open_?beam|bright|refs?(?![a-z])|refhst", DARK: "dark"}
@@ -47,11 +47,8 @@ ANGLES = (".txt", ".csv", ".dat", ".log", ".tlt", ".npy")
 
 @contextmanager
 def open_images(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Iterator[ScanFile]:
-    """An image file, or all images in a folder (of those names that `files` says), checked except for the frames.
-
-    given: what the images do not say, by name (`TAKES`). Errors: `InputError` for damaged images, and for values that
-    are not said, with the option that says them.
-    """
+    """An image file, or all images in a folder (of names that `files` says), checked except for the frames; `given` and
+    errors as of `open_scan`."""
     source = Path(path)
     parts = [(PROJECTION, stack_of(source))] if source.is_file() else _in_folder(source, given.get("files"))
     found = {} if source.is_file() or given.get("angles_deg") is not None else _angles(source)
@@ -210,10 +207,9 @@ def _recognises(path: Path) -> bool:
     return bool(images_in(path)) or folders or bool(_arrays_of(path, PROJECTION))
 
 
-LOADER = Loader(
-    *("images", f"images ({', '.join(IMAGES)}), one file or a folder of them, or an array (.npy)", _recognises),
-    *(reader(open_images), (*RAW_TAKES, "files", "black", "white"), open_images, True),
-)
+MARK = f"images ({', '.join(IMAGES)}), one file or a folder of them, or an array (.npy)"
+OF_IMAGES = (*RAW_TAKES, "files", "black", "white")
+LOADER = raw_loader("images", MARK, _recognises, open_images, OF_IMAGES, is_general=True)
 
 
 XTEKCT = ".xtekct"
@@ -283,10 +279,11 @@ def _nikon_entries(path: Path) -> Mapping[str, str]:
     return parser[SECTION]
 
 
-NIKON = Loader(
-    *("nikon", f"an {XTEKCT} file of a Nikon scanner", lambda path: path.is_file() and path.suffix.lower() == XTEKCT),
-    *(reader(open_nikon), (*RAW_TAKES, "files"), open_nikon),
-)
+def _is_nikon(path: Path) -> bool:
+    return path.is_file() and path.suffix.lower() == XTEKCT
+
+
+NIKON = raw_loader("nikon", f"an {XTEKCT} file of a Nikon scanner", _is_nikon, open_nikon, (*RAW_TAKES, "files"))
 
 
 FORMAT = "holosplat TIFF 1"
@@ -338,20 +335,17 @@ def _pages(file: Path, count: int) -> list[np.ndarray]:
     """The `count` pages of a TIFF file, each [H, W]."""
     pages = all_images(file)
     require(len(pages) == count, f"{file} must hold {count} pages, one a frame, but it holds {len(pages)}.")
-    for page in pages:
-        grey = page.ndim == 2 and page.dtype.kind in "iuf"
-        require(grey, f"{file} must hold grey images of numbers, but one is {page.dtype} of the shape {page.shape}.")
     return pages
 
 
-def _is_own(path: Path) -> bool:
-    """The folder, or in it scan.json or an image."""
+def _own_folder(path: Path) -> Path | None:
+    """The folder of a scan of our own that is named by itself, its scan.json or an image in it; None for others."""
     named = path.name == SCAN or path.suffix.lower() in (".tif", ".tiff")
-    return (_folder(path) / SCAN).is_file() and (path.is_dir() or named)
+    folder = path if path.is_dir() else path.parent if named else None
+    return folder if folder and (folder / SCAN).is_file() else None
 
 
-def _folder(path: Path) -> Path:
-    return path if path.is_dir() else path.parent
-
-
-TIFF = Loader("tiff", f"a folder with {SCAN}, or an image in it", _is_own, lambda path, given: read_tiff(_folder(path)))
+TIFF = Loader(
+    *("tiff", f"a folder with {SCAN}, or an image in it", lambda path: _own_folder(path) is not None),
+    lambda path, given: read_tiff(_own_folder(path) or path),
+)

@@ -10,14 +10,14 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from PIL import Image
 
-from ..checks import InputError, UnsaidError, at_least, in_range, require, shaped
+from ..checks import InputError, UnsaidError, in_range, require, shaped
 from ..geometry import Grid, Views
-from ..ranges import Metres, Positive, Signed, Small, checked_dataclass
+from ..ranges import Metres, Natural, Positive, Signed, Small, Within, checked_dataclass
 from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, Scan, checked_distance
 from .atomic import atomic_folder, write_json
 from .guard import undamaged
@@ -85,10 +85,8 @@ def write_png(path: Path, image: np.ndarray, kind: PngKind) -> None:
 
 
 def read_png(path: Path) -> tuple[np.ndarray, int]:
-    """An image's levels [H, W] as they stand in the file, and its white: 255 or 65535.
-
-    Colours must be equal and alpha opaque; `InputError` otherwise, or if the file is damaged.
-    """
+    """An image's levels [H, W] as stored, and its white: 255 or 65535. Colours must be equal and alpha opaque;
+    `InputError` otherwise, or if the file is damaged."""
     with undamaged(path, "a complete PNG image"), Image.open(path, formats=("PNG",)) as image:
         mode, values = image.mode, np.asarray(image)
     if mode.startswith("I"):  # 16 bits: "I;16", and "I" in older versions of Pillow
@@ -105,7 +103,6 @@ def read_png(path: Path) -> tuple[np.ndarray, int]:
 FORMAT = "holosplat NeRF-synthetic 1"
 TRAIN, TEST, VAL = (f"transforms_{split}.json" for split in ("train", "test", "val"))
 POINTS = "points3d.ply"
-CAMERA_DISTANCES = (10.0, 1e5)
 MOST_TANGENT = 0.02
 """The widest cameras of others that pass for parallel, as the tangent of half their angle: so much of its distance
 from the axis may a point stray, per half field of view of depth."""
@@ -117,14 +114,10 @@ class NerfOptions:
 
     png: PngKind = "grey16"
     """Kind of the images: 16-bit grey, or 8-bit RGBA for programs that read only this."""
-    camera_distance: float = 100.0
+    camera_distance: Annotated[float, Within(10, 1e5, unit="half fields of view")] = 100.0
     """Distance of the cameras from the origin, in half fields of view; larger ones are more parallel."""
-    seed_points: int = 20_000
+    seed_points: Natural = 20_000
     """Number of points in points3d.ply."""
-
-    def __post_init__(self) -> None:
-        in_range("camera_distance", self.camera_distance, *CAMERA_DISTANCES, unit="half fields of view")
-        at_least(self, 1, "seed_points")
 
 
 @checked_dataclass
@@ -208,9 +201,14 @@ def write_nerf_synthetic(
         for name, numbers in ((TRAIN, train), (TEST, np.flatnonzero(scan.is_test))):
             split = name.removeprefix("transforms_").removesuffix(".json")
             (folder / split).mkdir()
-            frames = [_write_frame(folder, f"{split}/r_{k:04d}", scan, n, head) for k, n in enumerate(numbers.tolist())]
-            for frame, n in zip(frames, numbers):
-                frame["transform_matrix"] = poses[n].tolist()
+            frames = []
+            for k, n in enumerate(numbers.tolist()):
+                path_of_image = f"{split}/r_{k:04d}"
+                grey = (scan.frames[n].astype(np.float64) - low) / (high - low or 1.0)
+                write_png(folder / f"{path_of_image}.png", grey, options.png)
+                exposure = {"index": n, **exposure_table(scan.exposures, n)}
+                pose = {"transform_matrix": poses[n].tolist()}
+                frames.append({"file_path": f"./{path_of_image}", "holosplat": exposure, **pose})
             table = {"camera_angle_x": 2 * math.atan(half), "frames": frames, "holosplat": head}
             for copy in (name, VAL) if name == TEST else (name,):
                 write_json(folder / copy, table)
@@ -222,11 +220,8 @@ def write_nerf_synthetic(
 
 
 def read_nerf_synthetic(path: str | Path, given: GivenOptics | None = None) -> Scan:
-    """The scan of a folder in the NeRF-synthetic layout.
-
-    A folder written by holosplat gives back everything, with intensities as exact as the images' bits. For a folder of
-    another program, whose cameras must be nearly parallel, `given` holds the values that the layout lacks.
-    """
+    """The scan of a NeRF-synthetic folder; `given` holds what the folders of other programs lack, whose cameras must be
+    nearly parallel. Intensities are as exact as the images' bits."""
     folder = Path(path)
     splits = [Table.read(folder / TRAIN)]
     own = "holosplat" in splits[0]
@@ -265,7 +260,8 @@ class _Content:
         tables = [split.tables("frames") for split in splits]
         require(len(tables[0]) > 0, f"{splits[0].label('frames')} must hold at least one frame, but it holds none.")
         frames = [frame for split in tables for frame in split]
-        files = [_image_file(frame) for frame in frames]
+        named = [frame.text("file_path").lower().endswith(".png") for frame in frames]  # .png is left away, or not
+        files = [frame.file("file_path", "" if whole else ".png") for frame, whole in zip(frames, named)]
         images = [read_png(file) for file in files]
         first, white = images[0]
         for file, (image, its_white) in zip(files, images):
@@ -278,20 +274,6 @@ class _Content:
     def intensities(self, low: float, high: float) -> np.ndarray:
         """[N, H, W] float32: black is `low`, white is `high`."""
         return (low + (high - low) / self.white * self.levels.astype(np.float64)).astype(np.float32)
-
-
-def _write_frame(folder: Path, name: str, scan: Scan, n: int, head: dict[str, Any]) -> dict[str, Any]:
-    """Write the image of frame `n`, and return its entry in the transforms, without the pose."""
-    kind: PngKind = "grey16" if head["white"] == LEVELS["grey16"] else "rgba8"
-    span = head["high"] - head["low"]
-    grey = (scan.frames[n].astype(np.float64) - head["low"]) / (span or 1.0)
-    write_png(folder / f"{name}.png", grey, kind)
-    return {"file_path": f"./{name}", "holosplat": {"index": n, **exposure_table(scan.exposures, n)}}
-
-
-def _image_file(frame: Table) -> Path:
-    """The frame's image: the layout leaves .png away, some programs write it."""
-    return frame.file("file_path", "" if frame.text("file_path").lower().endswith(".png") else ".png")
 
 
 def _own_scan(head: Table, content: _Content) -> Scan:
@@ -311,8 +293,7 @@ def _own_scan(head: Table, content: _Content) -> Scan:
 
 
 def _foreign_scan(folder: Path, splits: list[Table], content: _Content, given: GivenOptics) -> Scan:
-    """Cameras taken as parallel: the axes are turned round, and the offset of the centre of view from the origin is the
-    shift."""
+    """The scan of cameras that are taken for parallel; the centre of view is the shift."""
     angles = [split.number("camera_angle_x") for split in splits]
     require(len(set(angles)) == 1, f"{folder}: camera_angle_x must be the same for all frames, but it is {angles}.")
     tangent = math.tan(0.5 * angles[0])

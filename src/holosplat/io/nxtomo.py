@@ -19,10 +19,10 @@ from ..units import wavelength
 from ..version import __version__
 from .hdf5 import new_hdf5, put, room_for
 from .light import LIGHT, write_divided_light
-from .nxtomo_geometry import CONE
-from .raw_file import NOTHING, PROJECTION, RAW_TAKES, Loader
-from .scan_file import ANGLES, DATA, FLIPS, IMAGE_KEY, MASK, SPLIT, open_scan
-from .stored_frames import reader
+from .nxtomo_geometry import CONE, DATA_NAMES, FLIPS
+from .raw_file import NOTHING, PROJECTION, RAW_TAKES
+from .scan_file import ANGLES, IMAGE_KEY, MASK, SPLIT, open_scan
+from .stored_frames import raw_loader
 
 
 @dataclass(frozen=True)
@@ -48,13 +48,9 @@ class Add(Protocol):
 
 
 def read_scan(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Scan:
-    """The projections of an NXtomo file, flat-field corrected, and how they were taken.
-
-    Frames marked flat and dark correct the others: (frame - mean dark) / (mean flat - mean dark); frames
-    marked invalid are dropped. The projections are read when they are asked for (`StoredFrames`). given and
-    `InputError` as of `open_scan`.
-    """
-    return reader(open_scan)(Path(path), given)
+    """The projections of an NXtomo file, corrected by its flats and darks when they are read, and how they were taken;
+    `given` and errors as of `open_scan`."""
+    return LOADER.read(Path(path), given)
 
 
 def write_scan(path: str | Path, scan: Scan) -> None:
@@ -145,7 +141,7 @@ def _write_entry(
     _write_sample(_group(entry, "sample", "NXsample"), exposures)
     _write_process(_group(entry, "process", "NXprocess"), provenance)
     plot = _group(entry, "data", "NXdata", signal="data", axes=["rotation_angle", ".", "."])
-    for source in (DATA, IMAGE_KEY, ANGLES[0]):
+    for source in (DATA_NAMES[0], IMAGE_KEY, ANGLES[0]):
         entry[source].attrs["target"] = f"/entry/{source}"
         plot[source.rsplit("/", 1)[1]] = entry[source]
     return data
@@ -220,7 +216,8 @@ def _escaped(key: str) -> str:
     return escaped.replace(".", "%2E") if set(escaped) == {"."} else escaped
 
 
-LOADER = Loader(
-    *("nxtomo", "an HDF5 file", lambda path: path.is_file() and h5py.is_hdf5(path)),
-    *(read_scan, (*RAW_TAKES, "entry"), open_scan, True),
-)
+def _recognises(path: Path) -> bool:
+    return path.is_file() and h5py.is_hdf5(path)
+
+
+LOADER = raw_loader("nxtomo", "an HDF5 file", _recognises, open_scan, (*RAW_TAKES, "entry"), is_general=True)

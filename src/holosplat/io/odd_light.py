@@ -1,5 +1,4 @@
-"""Frames of the wrong kind in a file, which are left out, named or refused: flats and darks unlike the others, flats
-that lie otherwise than the projections do, projections without light or without matter."""
+"""Odd frames of a file: flats and darks unlike the others, misplaced flats, projections without light or matter."""
 
 from __future__ import annotations
 

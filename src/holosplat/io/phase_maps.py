@@ -21,10 +21,8 @@ UNITS = {"phase": "rad", "thickness": "m", "light": "relative intensity"}
 
 @dataclass(frozen=True)
 class PhaseMaps:
-    """Maps [V, H, W] of V frames, by name: phase [rad], and perhaps thickness [m] and light (relative intensity).
-
-    exposures: how the frames were taken; facts: material, method and what else is to be known, as texts
-    """
+    """Maps [V, H, W] of V frames by name: phase [rad], perhaps thickness [m] and light (relative); exposures of the
+    frames; facts: texts on material, method and the like."""
 
     maps: Mapping[str, np.ndarray]
     exposures: Exposures

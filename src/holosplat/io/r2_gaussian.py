@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import InputError, UnsaidError, at_least, finite, in_range, positive, require, shaped
+from ..checks import InputError, UnsaidError, finite, in_range, positive, require, shaped
 from ..geometry import Grid, Views
-from ..ranges import checked_dataclass
+from ..ranges import Natural, checked_dataclass
 from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, Scan
 from ..units import wavenumber
 from ..volume import Volume
@@ -41,11 +41,8 @@ class R2Options:
 
     truth: Volume | None = None
     """The true volume, with which that program scores its reconstruction (default: zeros)."""
-    seed_points: int = 50_000
+    seed_points: Natural = 50_000
     """Number of points to start from."""
-
-    def __post_init__(self) -> None:
-        at_least(self, 1, "seed_points")
 
 
 @dataclass(frozen=True)
@@ -109,11 +106,8 @@ def write_r2_gaussian(
 
 
 def read_r2_gaussian(path: str | Path, energy_kev: float | None = None, pixel_size: float | None = None) -> Scan:
-    """A folder of R²-Gaussian as a scan: frames `exp(-p)` of its line integrals p, in contact with the detector.
-
-    There is no phase in such data: one density in the scene's unit is an absorber with μ = 1 per unit, β = μ / 2k.
-    energy_kev and pixel_size [m]: needed for folders of other programs, which do not say.
-    """
+    """A folder of R²-Gaussian as frames `exp(-p)` of line integrals p, in contact: a density of 1 is an absorber with μ
+    = 1 per unit of length, β = μ / 2k. energy_kev, pixel_size [m]: for folders of other programs."""
     meta = Table.read(Path(path) / META)
     own = "holosplat" in meta
     given = energy_kev is not None or pixel_size is not None
@@ -212,10 +206,8 @@ def _projections(entries: list[Table], shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _pitch(scanner: Table, shape: tuple[int, int]) -> float:
-    """The pixels' edge in the file's unit of length; `InputError` for geometries that its two readers take differently.
-
-    In parallel beam its rasteriser spreads the image over the volume's cube and knows no offset.
-    """
+    """The pixels' edge in the file's unit of length, for a detector as large as the volume's cube without offset; else
+    `InputError`."""
     edges = scanner.numbers("sDetector", (2,)) / shape
     cube = scanner.numbers("sVoxel", (3,)).max()
     even = bool(np.allclose(edges, edges[0], rtol=1e-3) and np.allclose(edges * shape, cube, rtol=1e-3))

@@ -12,7 +12,6 @@ import hashlib
 import io
 import struct
 import zlib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
@@ -36,7 +35,7 @@ RANGE, CHUNK = 16, 13
 def summed(file: h5py.File) -> np.ndarray:
     """Offsets and sizes [N, 2] of the chunks whose values have checksums, in order."""
     file.flush()  # they have their places then
-    found = list[tuple[int, int]]()
+    found: list[tuple[int, int]] = []
 
     def take(name: str, item: h5py.Group | h5py.Dataset) -> None:
         if isinstance(item, h5py.Dataset) and item.chunks and item.fletcher32:
@@ -109,19 +108,11 @@ def _unpacked(packed: bytes, length: int, most: int) -> np.ndarray | None:
 
 def _digest(raw: IO[bytes], length: int, ranges: np.ndarray) -> bytes:
     """The SHA-256 of the ranges and of the first `length` bytes without them."""
-    found = hashlib.sha256(ranges.tobytes())
-    for start, stop in _between(length, ranges):
-        raw.seek(start)
-        while start < stop and (block := raw.read(min(BLOCK, stop - start))):
+    found, at = hashlib.sha256(ranges.tobytes()), 0
+    for offset, size in [*ranges.tolist(), (length, 0)]:
+        raw.seek(at)
+        while at < offset and (block := raw.read(min(BLOCK, offset - at))):
             found.update(block)
-            start += len(block)
+            at += len(block)
+        at = offset + size
     return found.digest()
-
-
-def _between(length: int, ranges: np.ndarray) -> Iterator[tuple[int, int]]:
-    """Where the bytes lie that are in no range."""
-    at = 0
-    for offset, size in ranges:
-        yield at, int(offset)
-        at = int(offset + size)
-    yield at, length

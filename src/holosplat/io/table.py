@@ -117,8 +117,7 @@ class Table:
 
 
 def beam_table(scan: Scan) -> dict[str, Any]:
-    """The values that all frames share: the texts of `provenance`, and `pixel_size_m` and `energy_kev` if they are the
-    same."""
+    """The values that all frames share: `provenance`, and `pixel_size_m` and `energy_kev` if they are the same."""
     views, exposures = scan.views, scan.exposures
     energy = {"energy_kev": float(exposures.energy_kev[0])} if exposures.has_one_energy else {}
     pixel = {"pixel_size_m": views.pixel_size} if views.has_one_pixel else {}
@@ -126,11 +125,8 @@ def beam_table(scan: Scan) -> dict[str, Any]:
 
 
 def exposure_table(exposures: Exposures, n: int) -> dict[str, Any]:
-    """Frame `n`: `rotation` [3, 3], `shift_m` [2], `distance_m`, `psf_sigma_px`, `time_s`; floats are kept exactly.
-
-    `energy_kev` and `pixel_size_m` too, where frames have several, `bandwidth`, where any has one, and `source_m`, of
-    cones of rays.
-    """
+    """Frame `n`: `rotation` [3, 3], `shift_m` [2], `distance_m`, `psf_sigma_px`, `time_s`, exactly; `energy_kev` and
+    `pixel_size_m` where frames have several, `bandwidth` where any has one, and `source_m` of cones of rays."""
     views = exposures.views
     energy = {} if exposures.has_one_energy else {"energy_kev": float(exposures.energy_kev[n])}
     pixel = {} if views.has_one_pixel else {"pixel_size_m": float(views.pixel_sizes[n])}
@@ -156,7 +152,12 @@ def read_exposures(beam: Table, frames: Sequence[Table], shape: tuple[int, int])
     """
     values = [[_per_frame(beam, f, name, default) for f in frames] for name, default in _NUMBERS]
     shifts = [f.numbers("shift_m", (2,)) if "shift_m" in f else np.zeros(2) for f in frames]
-    rotations = [_rotation(f) for f in frames]
+    rotations = [
+        rotation_y([f.number("angle_deg")])[0]
+        if "angle_deg" in f and "rotation" not in f
+        else f.numbers("rotation", (3, 3))
+        for f in frames
+    ]
     pixel_sizes = np.array([_per_frame(beam, f, "pixel_size_m", None) for f in frames])
     try:
         views = Views.of_pixels(np.array(rotations), np.array(shifts), shape, pixel_sizes)
@@ -188,9 +189,3 @@ def _per_frame(beam: Table, frame: Table, name: str, default: float | None) -> f
     if name in beam:
         return beam.number(name)
     return frame.number(name) if default is None else default
-
-
-def _rotation(frame: Table) -> np.ndarray:
-    if "angle_deg" in frame and "rotation" not in frame:
-        return rotation_y([frame.number("angle_deg")])[0]
-    return frame.numbers("rotation", (3, 3))

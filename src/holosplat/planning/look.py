@@ -29,8 +29,7 @@ RELATIVE = (0.2, 5.0)
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Power of frames over spatial frequency: frequency [B] in cycles a pixel, power [B] of each sample, and that of
-    white noise as strong as the frames' noise."""
+    """Power of frames [B] at frequencies [B] in cycles a pixel, and that of white noise as strong as theirs."""
 
     frequency: np.ndarray
     power: np.ndarray

@@ -236,8 +236,7 @@ def _coarse(sizes: Sizes) -> Sizes:
 
 
 def of_choice(sizes: Sizes, method: Auto) -> float:
-    """Seconds, at most, in which fits of both kinds to coarse frames decide, where first volumes do not
-    (`methods.illumination`, `methods.levels`)."""
+    """Seconds, at most, of fits of both kinds of matter to coarse frames (`methods.illumination`, `methods.levels`)."""
     if sizes.views < FEWEST:
         return 0.0
     coarse, folds = _coarse(sizes), MOST if sizes.views >= MANY else sizes.views
@@ -268,8 +267,7 @@ def _judged(fit: Needs, whole: Sizes) -> Needs:
 
 
 def _in_noise(sizes: Sizes, method: Method, matter: MatterKind | None) -> float:
-    """Seconds of the Gaussians with which surfaces begin in noise, on the pixels that they begin on; 0 where there are
-    none."""
+    """Seconds of the Gaussians with which surfaces begin in noise; 0 where there are none."""
     how = (
         method.gaussians if isinstance(method, Surfaces) or (isinstance(method, Auto) and matter == "levels") else None
     )
@@ -330,10 +328,8 @@ def _beside(sizes: Sizes, method: Method) -> Needs | None:
 
 
 def _bodies(sizes: Sizes, how: Gaussians, edges: bool) -> Needs:
-    """The same of Gaussians, and of surfaces cut out of them where there are `edges`.
-
-    Where surfaces of coarse pixels show the bodies, these are done sooner, and no fine volume is made.
-    """
+    """The same of Gaussians, and of surfaces cut out of them if there are `edges`; coarse pixels that show the bodies
+    spare a fine volume."""
     batch = how.fit.schedule.views_per_step
     fitted = replace(sizes, views=min(batch, sizes.views) if batch else sizes.views).waves()
     waves = max(Costs.waves * fitted, Costs.edges * sizes.waves(1) if edges else 0.0)

@@ -73,10 +73,8 @@ class Frame:
 
 
 def shown(obj: Stored) -> Shown:
-    """What is drawn of an object as it is: Gaussians, surfaces, or the surface at half of the largest |δ| of others.
-
-    Errors: `InputError` where there is no surface.
-    """
+    """What is drawn of an object: Gaussians, surfaces, or the surface at half of the largest |δ| of others;
+    `InputError` without one."""
     with torch.no_grad():
         if isinstance(obj, GaussianCloud):
             return _splats(obj)

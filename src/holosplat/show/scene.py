@@ -20,10 +20,8 @@ BOX = 1000
 
 
 class Scene:
-    """The scene of a page: one of several objects, chosen by a slider and cut by another one.
-
-    The objects may be replaced while it is shown; sliders stay where they are.
-    """
+    """The scene of a page: one of several objects, chosen by a slider and cut by another one, which stay where they are
+    when the objects are replaced."""
 
     def __init__(self, page: LiveView) -> None:
         self._page = page
@@ -75,8 +73,7 @@ class Scene:
 
 
 class Follow:
-    """The folder is only read. It is looked at by `look`, and the object is drawn anew where its checkpoint is another
-    one and a browser is there. What cannot be read just now is read the next time."""
+    """A run that another process fits: each new checkpoint is drawn if a browser is there. The folder is only read."""
 
     def __init__(self, page: LiveView, folder: RunFolder) -> None:
         self._page, self._folder, self._scene = page, folder, Scene(page)
