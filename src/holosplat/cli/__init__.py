@@ -37,7 +37,11 @@ NO_TORCH = (
 def main() -> None:
     """Run the command that the arguments name; where its libraries find no room, one sentence and exit code 2."""
     if "torch" not in sys.modules:
-        _require_room()
+        space, memory = left_by_limits()
+        if space < MAPPED:
+            give_up(_too_little(f"ulimit -v leaves {space / 1e9:.2g} GB"))
+        if memory < RESIDENT:
+            give_up(_too_little(f"its control group (a container, a cluster's job) leaves {memory / 1e9:.2g} GB"))
         atexit.register(gc.freeze)  # else Python searches all libraries for garbage as it ends
     try:
         from .entry import main as run
@@ -61,15 +65,6 @@ def _of_torch(error: ImportError) -> bool:
     """Whether torch is missing, or is installed but fails as it is loaded, for another reason than memory."""
     inside = (frame.f_globals.get("__name__") == "torch" for frame, _ in walk_tb(error.__traceback__))
     return error.name == "torch" or (any(inside) and not UNMAPPED.search(str(error)))
-
-
-def _require_room() -> None:
-    """Give up where a limit of this process leaves less than its libraries take."""
-    space, memory = left_by_limits()
-    if space < MAPPED:
-        give_up(_too_little(f"ulimit -v leaves {space / 1e9:.2g} GB"))
-    if memory < RESIDENT:
-        give_up(_too_little(f"its control group (a container, a cluster's job) leaves {memory / 1e9:.2g} GB"))
 
 
 def _too_little(found: str) -> str:

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from ..checks import InputError, require
+from ..io.atomic import is_taken
+from ..io.provenance import command_now
 from ..io.reading import Reading
 from ..ranges import Pixels, Seed, Weight, checked_dataclass
 from .align import AS_SAID, RefineOptions
@@ -32,11 +34,11 @@ class CarriedFlags:
     """How matter changes between the times of a scan."""
 
     motion: Literal["auto", "still", "each", "flow", "bodies"] | None = None
-    """still: one object for all times; each: a run for each time; flow: one object that a flow carries; bodies: closed
-    bodies on paths, as `track`; auto: by times set aside (default: one time)."""
+    """still: one object for all times; each: a run for each; flow: one object that a flow carries; bodies: closed
+    bodies, as `track`; auto: by times set aside (default: one time)."""
     fading: Weight = 0.0
-    """Standard deviation expected of what the logarithm of δ changes by over all times, where matter fades or grows
-    denser (0: it does not). About a third is a change by a third."""
+    """Expected standard deviation of the change of ln δ over all times, for matter that fades or grows denser (0:
+    none); 0.3 is a change by about a third."""
 
     def applied(self, reading: Reading) -> Reading:
         """`reading` of the times that --motion needs. Errors: `InputError` where --time-frame is given, too."""
@@ -80,15 +82,6 @@ class Asked:
         require(not ranges, f"--motion {named} needs one number for each constant; find it by reconstruct of one time.")
         shared = {"light": self.illumination.options(), "seed": seed}
         return Settings("reconstruct", method, self.how.kind_of_matter(), **shared)
-
-    def require_bodies(self, method: Method) -> None:
-        """`InputError` for what --motion bodies cannot be asked."""
-        from ..methods import Auto
-
-        stray = {"--refine": self.geometry.options() is not None}
-        stray |= {"--method": not isinstance(method, Auto), "--matter": self.how.kind_of_matter() is not None}
-        for name, given in stray.items():
-            require(not given, f"--motion bodies follows closed bodies through all times; leave {name}.")
 
     def ways(self, reading: Reading) -> dict[str, Any]:
         """What `workflows.reconstruct` takes by name; `InputError` for what does not go together."""
@@ -179,9 +172,7 @@ def reconstruct(
 
 def _with_motion(scan: Path, out: Path, asked: Asked, reading: Reading, seed: int, resume: bool) -> Asked:
     """What is asked, with the motion that frames choose, or have chosen for what is begun in `out`."""
-    from ..io.atomic import is_taken
     from ..io.formats import read_frames
-    from ..io.provenance import command_now
     from ..workflows.motion_choice import MOTION, begun_motion, choose_motion, motion_of
 
     settings = asked.each_time(asked.how.chosen(), reading, seed)
@@ -204,12 +195,16 @@ def _with_motion(scan: Path, out: Path, asked: Asked, reading: Reading, seed: in
 
 def _time_by_time(scan: Path, out: Path, asked: Asked, reading: Reading, seed: int, resume: bool) -> None:
     """Bodies followed through all times, or a run for each time."""
+    from ..methods import Auto
     from .series import reconstruct_each
     from .track import track
 
     method = asked.how.chosen()
     if asked.motion.motion == "bodies":
-        asked.require_bodies(method)
+        stray = {"--refine": asked.geometry.options() is not None}
+        stray |= {"--method": not isinstance(method, Auto), "--matter": asked.how.kind_of_matter() is not None}
+        for name, given in stray.items():
+            require(not given, f"--motion bodies follows closed bodies through all times; leave {name}.")
         track(scan, out, asked.matter, seed=seed, resume=resume, reading=reading, illumination=asked.illumination)
     else:
         reconstruct_each(scan, out, asked.each_time(method, reading, seed), asked.matter.prior, reading, resume)

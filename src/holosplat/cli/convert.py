@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
 from tyro.conf import Positional, arg
 
+from ..baselines.retrieve import Retrieved
+from ..baselines.retrieve import retrieve as act
 from ..checks import InputError, require
 from ..io.atomic import atomic_path
-from ..io.formats import HDF5_SUFFIXES, ScanFormat, loader_of, read_as, read_volume_file
+from ..io.formats import HDF5_SUFFIXES, ScanFormat, loader_of, read_as, read_frames, read_volume_file
 from ..io.images import TiffLayout, write_tiff
 from ..io.nerf_synthetic import NerfOptions, PngKind, grey_range, write_nerf_synthetic
 from ..io.nxtomo import write_scan
@@ -22,7 +24,7 @@ from ..io.reading import Reading
 from ..matter import DeltaBeta, KnownRatio, MaterialPrior
 from ..methods.method import STAND_IN_RATIO, shows_no_refraction
 from ..optics import retrieve_thickness
-from ..ranges import Metres, Natural, Positive, Signed, checked_dataclass
+from ..ranges import Metres, Natural, Positive, Signed, checked_dataclass, flag
 from ..scan import Scan
 from ..workflows.run_illumination import FixedPatternOptions, flatfield_corrected
 from .light import LightFlags
@@ -30,9 +32,6 @@ from .options import OneMaterial, PriorOptions
 from .places import Output
 from .progress import ProgressBar
 from .sentence import say
-
-if TYPE_CHECKING:
-    from ..baselines.retrieve import Retrieved
 
 
 @checked_dataclass
@@ -50,21 +49,14 @@ class WritingOptions:
     seed_points: Natural | None = None
     """nerf-synthetic, r2-gaussian: points to start from."""
 
-    def for_format(self, to: ScanFormat) -> dict[str, Any]:
-        """Those that are said; `InputError` for one that `to` does not know."""
-        said = {name: value for name, value in vars(self).items() if value is not None}
-        for name in said:
-            require(to in GOES_WITH[name], f"--{name.replace('_', '-')} goes with --to {' or '.join(GOES_WITH[name])}.")
-        return said
-
 
 @checked_dataclass
 class EveningOptions:
     """Light that is the same in all frames."""
 
     still_light: int | None = None
-    """Divide out what all frames for training have in common beside the matter that they show: light of up to so many
-    half waves across a frame, such as 4, or any pattern (0) (default: nothing)."""
+    """Divide out the light that all training frames share: up to so many half waves across a frame, such as 4, or any
+    pattern (0) (default: nothing)."""
     inside: Metres | None = None
     """With it: distance from the axis within which matter lies [m] (default: anywhere)."""
 
@@ -118,7 +110,9 @@ def convert(
         named = out.suffix.lower() in (NXTOMO, *HDF5_SUFFIXES)
         require(named, f"--to is required, for {out.name} says no format by its suffix ({NXTOMO} is nxtomo); add it.")
         to = "nxtomo"
-    said = writing.for_format(to)
+    said = {name: value for name, value in vars(writing).items() if value is not None}
+    for name in said:
+        require(to in GOES_WITH[name], f"{flag(name)} goes with --to {' or '.join(GOES_WITH[name])}.")
     require(
         reading.told.wall is None, "--wall is part of models and changes no frames; give it to reconstruct instead."
     )
@@ -212,9 +206,6 @@ def retrieve(
         out: HDF5 file to write (.h5), or folder to make: a TIFF stack a map, maps.json and a preview.
         method: Tikhonov through the full wave optics is the most reliable; docs/phase_retrieval.md compares them.
     """
-    from ..baselines.retrieve import retrieve as act
-    from ..io.formats import read_frames
-
     measured = read_frames(scan, reading).in_memory()
     material, level = matter.at(measured.exposures.reference_energy)
     with ProgressBar() as bar:

@@ -194,19 +194,15 @@ def command(name: str) -> Callable[..., None]:
 def _functions(arguments: list[str]) -> dict[str, Callable[..., None]]:
     """A function for each command, which does nothing but have a summary unless the first argument names it."""
     known = COMMANDS.own if arguments[:1] and arguments[0] in COMMANDS.own else COMMANDS
-    return {
-        name: command(name) if arguments[:1] == [name] else _summarised(summary) for name, (_, summary) in known.items()
-    }
+    found: dict[str, Callable[..., None]] = {}
+    for name, (_, summary) in known.items():
 
+        def unloaded() -> None:
+            pass
 
-def _summarised(summary: str) -> Callable[..., None]:
-    """A function that the parser shows with `summary`; it is never called."""
-
-    def unloaded() -> None:
-        pass
-
-    unloaded.__doc__ = summary
-    return unloaded
+        unloaded.__doc__ = summary
+        found[name] = command(name) if arguments[:1] == [name] else unloaded
+    return found
 
 
 AGAIN = "give the scan, the options and --out again, with --resume"
@@ -232,8 +228,8 @@ def resumed(arguments: Sequence[str]) -> list[str]:
 
 
 def is_made_by(path: Path, words: Sequence[str]) -> bool:
-    """Whether the file or folder `path` says that the command with these `words` made it, as it is, from inputs which
-    are what they were; of arguments that are too many files to be named one by one, this is taken to be so."""
+    """Whether the command with these `words` made `path`, unchanged since, from inputs that are unchanged, as far as
+    these are named one by one."""
     record = origin(path)
     with suppress(InputError), as_written(path):
         said, folder = shlex.split(record["command"])[1:], Path(from_home(record["folder"]))

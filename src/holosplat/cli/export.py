@@ -48,8 +48,8 @@ Sampling = tuple[tuple[int, int, int] | None, float | None]
 
 @dataclass(frozen=True)
 class Moment:
-    """A run as it is at one time. frame: the time's number, which names of its files add, or None; time [s]; bodies:
-    closed meshes [m], if it has them, of a run in motion in the order of their identities; folder: of the run."""
+    """A run at one time [s]. frame: its number, which file names add, or None; bodies: closed meshes [m], if it has
+    them; folder: of the run."""
 
     frame: int | None
     time: float

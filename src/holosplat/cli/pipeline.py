@@ -59,8 +59,8 @@ class Stage:
         return [place for place in self.places() if place.written]
 
     def state(self) -> str:
-        """new: no output is there; done: all are, whole, and made by this command from the same input; begun: some are,
-        or not whole; other: another command or input made one of them."""
+        """new: nothing is there; done: all outputs are, whole and of this command and input; begun: some; other: of
+        another."""
         there = [
             path
             for out in self.outputs()
@@ -166,14 +166,8 @@ def _stages(path: Path) -> list[Stage]:
         words = _words(name, table, path, before)
         found.append(_parsed(name, words, path))
         before = table.get("out", before)
-    _require_apart(found, path)
-    return found
-
-
-def _require_apart(stages: Sequence[Stage], path: Path) -> None:
-    """`InputError` for a stage that would write over the pipeline file, an input, or what another stage makes."""
     read, made = [Place("PIPELINE", path, written=False)], list[Place]()
-    for stage in stages:
+    for stage in found:  # which must not write over the pipeline file, an input, or what another stage makes
         places = stage.places()
         read += [one for one in places if not (one.written or any(map(one.is_same, made)))]
         made += [one for one in places if one.written]
@@ -181,6 +175,7 @@ def _require_apart(stages: Sequence[Stage], path: Path) -> None:
             require_apart([*read, *made])
         except InputError as error:
             raise InputError(f"[{stage.name}] of {path}: {error}") from None
+    return found
 
 
 def _require_known(table: Mapping[str, Any], known: Sequence[str], where: str, are: str) -> None:

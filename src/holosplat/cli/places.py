@@ -125,8 +125,8 @@ def places_of(function: Callable[..., Any], values: Mapping[str, Any]) -> list[P
 
 
 def require_apart(places: Sequence[Place]) -> None:
-    """`InputError` that names the first output which is an input, another output, or within a run or an input; with
-    each path goes what belongs to it (`Place.companions`)."""
+    """`InputError` for an output that is an input, another output, or within a run or an input, with their
+    companions."""
     for place in places:
         require(
             not place.written or bool(place.path.name),
@@ -137,8 +137,9 @@ def require_apart(places: Sequence[Place]) -> None:
     outputs = [one for one in every if one.written]
     for number, out in enumerate(outputs):
         for other in outputs[:number]:
+            alike = [(one.path.parent.resolve(), TIME.sub("", one.path.name)) for one in (out, other)]
             require(
-                not (out.is_same(other) or _of_one_series(out.path, other.path)),
+                not out.is_same(other) and alike[0] != alike[1],  # nor files of single times
                 f"{out.flag} and {other.flag} must be different places, but they are {out.path} and {other.path}; name "
                 "another one.",
             )
@@ -149,7 +150,16 @@ def require_apart(places: Sequence[Place]) -> None:
                 f"{folder}; name another place.",
             )
         for source in read:
-            _require_kept(out, source)
+            require(
+                not out.is_same(source),
+                f"{out.flag} must not be what the command reads, but {out.path} is; name another place.",
+            )
+            inside = out.path.is_file() and source.path.is_dir() and _is_in(out.path, source.path)
+            require(
+                not inside,
+                f"{out.flag} must not replace a file of the folder {source.path}, which the command reads, but "
+                f"{out.path} is one; name another place.",
+            )
 
 
 def _require_free(out: Place, places: Sequence[Place], force: bool, resume: bool | None) -> None:
@@ -207,8 +217,9 @@ def _set_aside(paths: Sequence[Path]) -> Iterator[None]:
     finally:
         for folder in folders:
             if is_taken(folder):
-                old = _aside(folder)
-                old.unlink() if old.is_symlink() else shutil.rmtree(old, ignore_errors=True)
+                if _aside(folder).is_symlink():
+                    _aside(folder).unlink()
+                shutil.rmtree(_aside(folder), ignore_errors=True)
             elif _aside(folder).is_dir():
                 shutil.rmtree(folder, ignore_errors=True)
                 os.rename(_aside(folder), folder)
@@ -226,28 +237,8 @@ def is_run(folder: Path) -> bool:
     return (folder / CONFIG).is_file() and any((folder / name).exists() for name in OF_A_RUN)
 
 
-def _require_kept(out: Place, source: Place) -> None:
-    """`InputError` where writing `out` takes away `source`, or a file in it."""
-    require(
-        not out.is_same(source),
-        f"{out.flag} must not be what the command reads, but {out.path} is; name another place.",
-    )
-    inside = out.path.is_file() and source.path.is_dir() and _is_in(out.path, source.path)
-    require(
-        not inside,
-        f"{out.flag} must not replace a file of the folder {source.path}, which the command reads, but {out.path} is "
-        "one; name another place.",
-    )
-
-
 def _is_in(path: Path, folder: Path) -> bool:
     return Path(os.path.realpath(folder)) in Path(os.path.realpath(path)).parents
-
-
-def _of_one_series(one: Path, other: Path) -> bool:
-    """Whether files of single times of the one may have the name of the other, or of its files."""
-    names = [(path.parent.resolve(), TIME.sub("", path.name)) for path in (one, other)]
-    return names[0] == names[1]
 
 
 def _places(values: Mapping[str, Any], hints: Mapping[str, Any]) -> Iterator[Place]:

@@ -12,12 +12,16 @@ from tyro.conf import arg
 
 from ..checks import in_range, require
 from ..frames import evenly
+from ..io.atomic import atomic_path, require_writable, write_rows
+from ..io.provenance import require_free
+from ..matter import MaterialPrior
 from ..mesh import TriangleMesh
 from ..planning.contrast import Setup, Subject
 from ..planning.plan import Motion, Plan, Recording, Sampling, Storage, Survey, experiment, survey
 from ..planning.plan import plan as make_plan
 from ..progress import Advance
 from ..ranges import Grams, Many, Metres, Positive, Signed, Small, checked_dataclass
+from ..scan import DISTANCE_RANGE_M, ENERGY_RANGE_KEV
 from ..units import in_percent
 from .options import MaterialOptions
 from .places import Output
@@ -114,10 +118,6 @@ class RangeOptions:
 
     def check(self) -> None:
         """`InputError` unless ranges and files go together."""
-        from ..io.atomic import require_writable
-        from ..io.provenance import require_free
-        from ..scan import DISTANCE_RANGE_M, ENERGY_RANGE_KEV
-
         if not self.wanted:
             require(self.out is None, "--out needs --distance-range or --energy-range, or both.")
             return
@@ -173,7 +173,6 @@ def plan(
             surveyed = ranges.run(subject, beam, record.photons_per_pixel, bar.of("surveying"))
     foreseen = None
     if times is not None:
-        from ..matter import MaterialPrior
         from ..methods import METHODS
         from ..workflows.preconditions import FEWEST_COLUMNS
         from ..workflows.rehearsal import SIDE, foresee
@@ -225,7 +224,6 @@ def _numbers(values: dict[str, Any]) -> dict[str, Any]:
 
 def _write(path: Path, surveyed: Survey) -> None:
     """The picture and the table of a survey."""
-    from ..io.atomic import atomic_path, write_rows
     from ..report.plan import survey_figure  # matplotlib, which most plans need not
 
     rows = surveyed.table()

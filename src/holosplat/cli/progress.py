@@ -85,7 +85,11 @@ class ProgressBar:
         if stage != self._stage:
             self._close()
             self._begin(stage, fraction)
-        said = _described(record) if record else ""
+        said = ""
+        if record:
+            speed = record["step"] / record["seconds"] if record["seconds"] > 0 else 0.0
+            size = f"{record['count']:.0f} Gaussians, " if "count" in record else ""
+            said = f"loss {record['loss']:.3e}, {size}{speed:.1f} steps/s"
         if self._lines is not None:
             self._lines.show(fraction, said)
         if self._bar is not None:
@@ -154,12 +158,6 @@ def _spent(seconds: float) -> str:
 
 _FORMAT = "{desc:28s} {percentage:3.0f}%|{bar:24}| {elapsed}{postfix}"
 _WITH_LEFT = _FORMAT.replace("{elapsed}", "{elapsed}, {remaining} left")
-
-
-def _described(record: Mapping[str, float]) -> str:
-    speed = record["step"] / record["seconds"] if record["seconds"] > 0 else 0.0
-    size = f"{record['count']:.0f} Gaussians, " if "count" in record else ""
-    return f"loss {record['loss']:.3e}, {size}{speed:.1f} steps/s"
 
 
 OWN = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d ")

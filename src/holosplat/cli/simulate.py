@@ -8,10 +8,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
 from tyro.conf import Positional
 
 from ..beamline.light import EVEN_LIGHT, UnevenLight
+from ..beamline.misalignment import Misalignment
 from ..checks import InputError, require
+from ..geometry import Grid, Views
+from ..io.atomic import require_writable
 from ..ranges import checked_dataclass
 from .options import (
     BeamlineOptions,
@@ -27,11 +31,8 @@ from .sentence import say, tell
 from .specimen import NO_SPECTRUM, SourceOptions, SpecimenOptions
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from ..beamline.series import Timing
     from ..beamline.simulate import Filling
-    from ..geometry import Views
     from ..specimens.drawn import Drawn
     from ..specimens.scene import MeshScene, MeshSeries
     from ..volume import Object
@@ -47,8 +48,8 @@ class TruthOptions:
     truth_frames: tuple[int, ...] = ()
     """Series: write the true volume at these times instead, counted from 0, to TRUTH_t0000.h5 and so on."""
     truth_regions: bool = False
-    """Matter that may fill the field: also write its named parts, such as bubbles, beside --truth as TRUTH_bubbles.h5
-    and so on; their δ is the share of each voxel that the part fills."""
+    """Also write the named parts of matter that may fill the field, as TRUTH_bubbles.h5 and so on (shares of
+    voxels)."""
     truth_mesh: Output | None = None
     """STL file: the surfaces of the truth, where it has them, in micrometres."""
     true_exposures: Output | None = None
@@ -56,7 +57,6 @@ class TruthOptions:
 
     def require_usable(self, out: Path) -> None:
         """`InputError` unless all files, `out` among them, can be written."""
-        from ..io.atomic import require_writable
         from ..io.formats import volume_format
 
         require(self.truth is not None or not self.truth_frames, "--truth-frames needs --truth.")
@@ -149,10 +149,9 @@ def simulate(
             one file of any format of `export --volume`, or TIFF images. None with --specimen.
         out: Scan file to write (NXtomo).
     """
-    import numpy as np
-
     from ..backends import resolve
     from ..beamline.series import held_out
+    from ..beamline.simulate import Simulation
     from ..io.nxtomo import scan_writer
     from ..planning.acts import of_simulation
 
@@ -165,7 +164,9 @@ def simulate(
     of_source, beamline = source.facts(beamline), source.applied(beamline)
     named = imaged.generated.in_medium(filling)
     views, filled = source.rays(beamline.planned()), named.filling(beamline.medium_index)
-    true_views = experiment.misalignment.errors().true_exposures(views)
+    off = experiment.misalignment
+    errors = (off.misalign_shift, off.misalign_rotation, off.misalign_distance, off.misalign_seed)
+    true_views = Misalignment(*errors, off.misalign_magnification).true_exposures(views)
     with ProgressBar() as bar:
         times = imaged.generated.timing(motion) if imaged.generated.specimen else np.zeros(1)
         generated = imaged.continuous(files, beamline, filled, float(times[-1]))
@@ -184,7 +185,8 @@ def simulate(
         f"views and times must make at most {MOST_FRAMES} frames, but they make {count}; take fewer of --views or "
         "--frames.",
     )
-    how = replace(experiment.noise.simulation(motion.shutter(), experiment.light), backend=experiment.backend)
+    recorded = {"shutter": motion.shutter(), "light": experiment.light, "backend": experiment.backend}
+    how = Simulation(experiment.noise.photons_per_pixel, experiment.noise.seed, **recorded)
     missing = specimen.matter.missing_field(true_views.views)
     if specimen.goes_on:
         say("the matter, or its medium, goes on beyond the field of view; the frames are made with it")
@@ -202,8 +204,7 @@ def simulate(
         facts["material"] = named.material
     regions, targets = truth.of_regions(specimen.regions, volumes), [(out, nominal, facts)]
     if truth.true_exposures:
-        errors = {name: f"{value:g}" for name, value in vars(experiment.misalignment).items()}
-        targets.append((truth.true_exposures, true, facts | errors))
+        targets.append((truth.true_exposures, true, facts | {name: f"{value:g}" for name, value in vars(off).items()}))
     tell("the simulation", of_simulation(true_views, how.samples(true_views), len(true)), out)
     if truth.write_mesh(specimen.matter):
         say(f"wrote {truth.truth_mesh}: the true surfaces")
@@ -234,9 +235,7 @@ def _specimen(
     bar: ProgressBar,
 ) -> _Specimen:
     """The bodies of `meshes`: moving, where there is a `timing`."""
-    import numpy as np
-
-    from ..beamline.series import read_series
+    from ..beamline.series import SeriesFiles, read_series
     from ..beamline.simulate import read_scene
     from ..io.paraview import COLLECTION, seeming_snapshots
 
@@ -254,7 +253,8 @@ def _specimen(
             )
         return _Specimen(matter, np.zeros(1), _facts(matter))
     show = bar.of("reading snapshots")
-    series, times = read_series(meshes, filling, beamline.energy_kev, timing, files.series(), show)
+    told = SeriesFiles(files.length_unit, files.origin, files.snapshot_interval, files.time_unit, files.period)
+    series, times = read_series(meshes, filling, beamline.energy_kev, timing, told, show)
     facts = {"frame_rate_hz": f"{timing.frame_rate:g}", "snapshots": str(len(series.snapshots))}
     return _Specimen(series, times, _facts(series.snapshots[0]) | facts)
 
@@ -286,7 +286,6 @@ def _still(
 
 
 def _write_truth(path: Path, matter: Object, views: Views) -> None:
-    from ..geometry import Grid
     from ..io.formats import write_volume_file
 
     with ProgressBar() as bar:

@@ -8,15 +8,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
+import numpy as np
 from tyro.conf import UseAppendAction, arg
 
 from ..checks import InputError, require
 from ..ranges import Grams, Many, Metres, Positive, Seed, Signed, Small, SomeShare, checked_dataclass
+from ..tables import overridden, to_table
 from .options import BeamlineOptions, MaterialOptions, MeshOptions, MotionOptions
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from ..beamline.simulate import Filling, Simulation
     from ..matter import DeltaBeta
     from ..optics.coherence import Spectrum
@@ -196,8 +196,8 @@ class GeneratedOptions:
     specimen_seed: Seed = 0
     """Seed of the specimen."""
     specimen_motion: float | None = None
-    """How far it goes from the first frame to the last: by how much the middle of the stirred blob turns [degrees]
-    (default: 60), or which share of its gas the collapsing foam loses (default: 0.5)."""
+    """Motion from the first frame to the last: turn of the middle of the stirred blob [degrees] (default: 60), or lost
+    share of gas of the collapsing foam (default: 0.5)."""
     core: str | None = None
     """Formula or name of what --material surrounds: in coated droplets, a cuvette, a channel, or the absorber."""
     core_density: Grams | None = None
@@ -205,8 +205,6 @@ class GeneratedOptions:
 
     def timing(self, motion: MotionOptions) -> np.ndarray:
         """The times [T] of the frames [s], the first at 0; `InputError` where `motion` and the specimen do not fit."""
-        import numpy as np
-
         timing = motion.timing()
         if self.specimen not in MOVING:
             require(timing is None, "--frame-rate is of moving meshes, or of a specimen that moves; leave it out.")
@@ -227,8 +225,6 @@ class GeneratedOptions:
 
     def in_field(self, beamline: BeamlineOptions) -> AnyMatter | None:
         """The matter that may fill the field, with its parameters; None for other specimens."""
-        from ..tables import overridden
-
         kind = self._kind()
         require(
             self.specimen_motion is None or self.specimen in CARRIED,
@@ -257,8 +253,6 @@ class GeneratedOptions:
 
     def facts(self, beamline: BeamlineOptions) -> dict[str, str]:
         """What the scan file says of the specimen: its kind, seed, parameters, and what is inside."""
-        from ..tables import to_table
-
         said = {"specimen": str(self.specimen), "specimen_seed": str(self.specimen_seed)}
         if (found := self.in_field(beamline)) is None:
             return said

@@ -82,11 +82,11 @@ class MotionFlags:
     rounds: int = 4
     """How often bodies are looked for beside those that are known, at most."""
     learned: bool = True
-    """Bodies of single times are found in what the package's network guesses, where frames do not contradict it and its
-    bodies explain clearly more: red cells in two or three beams."""
+    """Find bodies of single times by the package's network, if frames do not contradict it and its bodies explain
+    clearly more (red cells in two or three beams)."""
     cells: bool = True
-    """In two beams, bodies that the network guesses are followed as red cells, too, by their shape at rest; these are
-    kept unless bodies of any shape leave clearly less of the frames."""
+    """In two beams, also follow the network's bodies as red cells of known shape; kept unless bodies of any shape fit
+    clearly better."""
     least_volume: float = 30.0
     """Bodies of fewer voxels, of a pixel's edge, are not followed."""
     volume_kept: Weight = 0.006

@@ -169,8 +169,7 @@ def _cameras(path: Path, given: Mapping[str, Any]) -> tuple[KeyStack, ...]:
 
 
 def _trains(path: Path, run: Any, names: list[str], wanted: str | None) -> np.ndarray:
-    """The trains' identities, of those of which all cameras have frames, in their order, with a warning of those of
-    which some camera has none, and of those that no file has, between the others."""
+    """The trains of which all cameras have frames, in their order, with a warning of lost ones between them."""
     having = [set(run[name, PIXELS].drop_empty_trains().train_ids) for name in names]
     common, known = set.intersection(*having), set(run.train_ids).union(*having)
     every = min(np.diff(sorted(known)), default=1)

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -28,7 +29,7 @@ from .hdf5 import open_hdf5
 from .hdf5_guard import is_vouched
 from .ome import TIFF_SUFFIXES, ZARR_SUFFIX, read_ome_tiff, read_ome_zarr, require_zarr, write_ome_tiff, write_ome_zarr
 from .paraview import read_vti, write_vti
-from .plain_values import both, read_mrc, read_nrrd, write_mrc, write_nrrd
+from .plain_values import both, read_both, read_mrc, read_nrrd, write_mrc, write_nrrd
 from .raw_file import Loader, ScanFile, folder_with
 from .reading import Reading
 from .stacks import all_images
@@ -216,14 +217,14 @@ FORMATS = {
     **dict.fromkeys(TIFF_SUFFIXES, VolumeFormat(_write_tiff, read_ome_tiff)),
     ZARR_SUFFIX: VolumeFormat(write_ome_zarr, read_ome_zarr, needs=require_zarr),
     ".vti": VolumeFormat(write_vti, read_vti),
-    ".nrrd": VolumeFormat(write_nrrd, read_nrrd, both),
-    ".mrc": VolumeFormat(write_mrc, read_mrc, both),
+    ".nrrd": VolumeFormat(write_nrrd, partial(read_both, read_one=read_nrrd), both),
+    ".mrc": VolumeFormat(write_mrc, partial(read_both, read_one=read_mrc), both),
 }
 
 
 def volume_format(path: Path, called: str = "a volume") -> VolumeFormat:
-    """The format that the suffix of `path` names; `InputError`, which calls the path `called`, for any other, and where
-    its package is missing."""
+    """The format of the suffix of `path`, which messages call `called`; `InputError` for others, and for a missing
+    package."""
     found = FORMATS.get(path.suffix.lower())
     require(
         found is not None,
@@ -243,8 +244,8 @@ def write_volume_file(
     of: Contents = REFRACTION,
     beside: Beside = ALONE,
 ) -> None:
-    """Write δ and β (or what arrays are `of`) of `obj` on `grid` in the format of the suffix of `path`; beside: more
-    arrays, which only HDF5 holds."""
+    """Write δ and β (or arrays `of`) of `obj` on `grid`, by the suffix of `path`, with what is `beside` them in
+    HDF5."""
     if beside and path.suffix.lower() in HDF5_SUFFIXES:
         write_voxels(path, obj, grid, on_progress, of, beside)
     else:

@@ -75,8 +75,8 @@ class Fields:
         return next((name for name in names if name in self.group), None)
 
     def need(self, *names: str, way_out: str = "add it", stand_in: Mapping[str, Any] = MappingProxyType({})) -> str:
-        """The first of `names` that exists; `InputError` with the advice `way_out` when none does, or `UnsaidError`
-        with `stand_in`."""
+        """The first of `names` that exists; otherwise `InputError` with a `way_out`, or `UnsaidError` with
+        `stand_in`."""
         found = self.find(*names)
         if found is None:
             others = "".join(f" (or {self._below}/{name})" for name in names[1:])
@@ -252,15 +252,3 @@ class _Sink(io.RawIOBase):
     def truncate(self, size: int | None = None) -> int:
         """As of a file."""
         return self._tried(lambda: self._raw.truncate(size), size or 0)
-
-    def readable(self) -> bool:
-        """It is."""
-        return True
-
-    def seekable(self) -> bool:
-        """It is."""
-        return True
-
-    def writable(self) -> bool:
-        """It is."""
-        return True

@@ -97,8 +97,15 @@ def require_own(file: h5py.File, path: Path) -> None:
 
 def _others(file: h5py.File, path: Path, allowed: bool) -> list[Path]:
     """The HDF5 files that an open one refers to, once all else of it is in order."""
-    found: list[Path] = []
-    for name, kind in _links(file, path):
+    found, links = list[Path](), list[tuple[bytes, int]]()
+
+    def take(name: bytes, info: h5l.LinkInfo) -> bool | None:
+        links.append((name, info.type))
+        return True if len(links) > MOST else None
+
+    file.id.links.visit(take, info=True)  # which follows none of them
+    require(len(links) <= MOST, f"{path} must hold at most {MOST} entries, but it holds more.")
+    for name, kind in links:
         inner = f"/{name.decode(errors='replace')}"
         require(name.count(b"/") < DEEPEST, f"{path} must not be nested more than {DEEPEST} deep, but it is.")
         if kind == h5l.TYPE_EXTERNAL:
@@ -150,20 +157,6 @@ def is_vouched(path: Path) -> bool:
 
 def _refers(path: Path, inner: str, what: str) -> str:
     return f"{path} must hold its own values, but {inner} {what}; if you trust both, add --allow-external."
-
-
-def _links(file: h5py.File, path: Path) -> Iterator[tuple[bytes, int]]:
-    """Names and kinds of all links in a file; links are not followed."""
-    found: list[tuple[bytes, int]] = []
-
-    def take(name: bytes, info: h5l.LinkInfo) -> bool | None:
-        found.append((name, info.type))
-        return True if len(found) > MOST else None
-
-    file.id.links.visit(take, info=True)
-    if len(found) > MOST:
-        raise InputError(f"{path} must hold at most {MOST} entries, but it holds more.")
-    return iter(found)
 
 
 DEFLATION = 1032

@@ -47,8 +47,8 @@ ANGLES = (".txt", ".csv", ".dat", ".log", ".tlt", ".npy")
 
 @contextmanager
 def open_images(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Iterator[ScanFile]:
-    """An image file, or all images in a folder (of names that `files` says), checked except for the frames; `given` and
-    errors as of `open_scan`."""
+    """An image file, or images in a folder (of names that `files` says); frames are not read; `given` and errors as of
+    `open_scan`."""
     source = Path(path)
     parts = [(PROJECTION, stack_of(source))] if source.is_file() else _in_folder(source, given.get("files"))
     found = {} if source.is_file() or given.get("angles_deg") is not None else _angles(source)
@@ -83,14 +83,14 @@ def _in_folder(folder: Path, pattern: str | None) -> list[tuple[int, Any]]:
     """The projections in a folder, or in a folder within it, and the flats and darks beside them."""
     places = _places(folder)
     light = {kind: _fields_of_light(folder, places, kind) for kind in FIELDS}
-    apart = {kind for kind in FIELDS if _folders_of(folder, kind)}
+    apart = {_kind(path) for path in _folders(folder)}
     files = [file for place in places for file in images_in(place, pattern) if _kind(file) in {None, *apart}]
     arrays = [] if places or pattern else _arrays_of(folder, PROJECTION)
     named = f" named {pattern}" if pattern else ""
     require(
         len(files) + len(arrays) > 0, f"{folder} must hold projections ({', '.join(IMAGES)}), but it holds none{named}."
     )
-    unread = [path.name for path in _folders(folder) if _kind(path) is None and path not in places]
+    unread = [path.name for path in _of_images(folder) if _kind(path) is None and path not in places]
     if unread:
         note(f"{folder}: the images in {', '.join(unread)} are not read")
     stack = light_frames(arrays[0], "proj|data", PROJECTION) if arrays else ImageStack.of(in_order(files))
@@ -99,7 +99,7 @@ def _in_folder(folder: Path, pattern: str | None) -> list[tuple[int, Any]]:
 
 def _places(folder: Path) -> list[Path]:
     """The folders of projections: those within `folder` that are named so, or itself, or the only one that is left."""
-    inner = [path for path in _folders(folder) if _kind(path) is None]
+    inner = [path for path in _of_images(folder) if _kind(path) is None]
     named = [path for path in inner if PROJECTIONS.match(path.name)]
     own = [file for file in images_in(folder) if _kind(file) is None]
     places = named or ([folder] if own else inner)
@@ -112,8 +112,12 @@ def _places(folder: Path) -> list[Path]:
 
 
 def _folders(folder: Path) -> list[Path]:
-    """The folders of images within `folder`, by name."""
-    return sorted(path for path in folder.iterdir() if path.is_dir() and not is_hidden(path) and images_in(path))
+    """The folders within `folder`, by name."""
+    return sorted(path for path in folder.iterdir() if path.is_dir() and not is_hidden(path))
+
+
+def _of_images(folder: Path) -> list[Path]:
+    return [path for path in _folders(folder) if images_in(path)]
 
 
 def _fields_of_light(folder: Path, places: list[Path], kind: int) -> Any:
@@ -122,7 +126,7 @@ def _fields_of_light(folder: Path, places: list[Path], kind: int) -> Any:
 
     Errors: `InputError` for a folder of such a name without frames, and for several arrays.
     """
-    inner = _folders_of(folder, kind)
+    inner = [path for path in _folders(folder) if _kind(path) == kind]
     images = [file for path in inner for file in images_in(path)]
     images += [file for file in images_in(folder) if _kind(file) == kind]
     if not inner:
@@ -141,11 +145,6 @@ def _fields_of_light(folder: Path, places: list[Path], kind: int) -> Any:
         f"--{KINDS[kind]}.",
     )
     return light_frames(files[0], FIELDS[kind], kind) if files else None
-
-
-def _folders_of(folder: Path, kind: int) -> list[Path]:
-    """The folders within `folder` whose names say that they are of `kind`, whatever they hold."""
-    return sorted(path for path in folder.iterdir() if path.is_dir() and not is_hidden(path) and _kind(path) == kind)
 
 
 def _arrays_in(folder: Path) -> list[Path]:
@@ -203,7 +202,7 @@ def _tell_order(found: ScanFile) -> None:
 def _recognises(path: Path) -> bool:
     if path.is_file():
         return path.suffix.lower() in (*IMAGES, ".npy")
-    folders = any(PROJECTIONS.match(one.name) or _kind(one) for one in _folders(path))
+    folders = any(PROJECTIONS.match(one.name) or _kind(one) for one in _of_images(path))
     return bool(images_in(path)) or folders or bool(_arrays_of(path, PROJECTION))
 
 

@@ -137,8 +137,8 @@ class Placed(Rearranged):
 
 
 def heightened(scan: Scan) -> Scan:
-    """The scan on frames as tall as what the views show together, if these turn about one axis and move along it so far
-    that none of its rows is in all frames, which is said; else the scan as it is."""
+    """The scan on frames as tall as all views together, which it says, for one that moves farther along one axis than a
+    frame."""
     views = scan.views
     upright = np.allclose(views.rotations[:, 1], [0.0, 1.0, 0.0]) and views.has_one_pixel and views.sources is None
     rows, height = views.shifts[:, 1] / views.pixel_size if upright else np.zeros(len(views)), views.shape[0]
@@ -165,8 +165,8 @@ def of_parts(found: Exposures, tall: Scan, scan: Scan) -> Exposures:
 
 
 def stitched(scan: Scan) -> Scan:
-    """The scan of half a turn on frames as wide as what the turn sweeps, if it is a half acquisition whose frames all
-    have opposite ones, which is said; else the scan as it is."""
+    """The scan of half a turn on wider frames, which it says, for a half acquisition whose frames all have opposite
+    ones."""
     if not is_half_acquisition(scan):
         return scan
     views, angles = scan.views, angles_of(scan.views)

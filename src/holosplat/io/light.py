@@ -26,8 +26,8 @@ def write_light(
     still: np.ndarray | None = None,
     marks: Mapping[str, str] = MappingProxyType({}),
 ) -> None:
-    """Write coefficients [V, (K + 1)²] of `smooth_modes`, light = `exp(Σ c m)`, and the light [H, W] that all frames
-    share, where there are any; marks: further attributes."""
+    """Write coefficients [V, (K + 1)²] of `smooth_modes`, the light [H, W] of all frames, and `marks`; None: there is
+    none."""
     from ..optics.background import ORDER  # needs torch, which takes longer than all else
 
     with new_hdf5(path) as file:

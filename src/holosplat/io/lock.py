@@ -114,8 +114,8 @@ def _kept(target: Path) -> str:
 
 
 def flushed(path: Path) -> None:
-    """Wait until a file, or the names in a folder (as far as its file system allows), are on the disk (fsync);
-    `OSError` where the disk fails."""
+    """Wait until a file, or the names in a folder if its file system can, are on the disk (fsync); `OSError` if it
+    fails."""
     handle = os.open(path, os.O_RDONLY)
     try:
         with suppress(OSError) if path.is_dir() else nullcontext():

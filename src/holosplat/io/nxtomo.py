@@ -48,8 +48,7 @@ class Add(Protocol):
 
 
 def read_scan(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Scan:
-    """The projections of an NXtomo file, corrected by its flats and darks when they are read, and how they were taken;
-    `given` and errors as of `open_scan`."""
+    """The projections of an NXtomo file, corrected when they are read; `given` and errors as of `open_scan`."""
     return LOADER.read(Path(path), given)
 
 
@@ -138,7 +137,13 @@ def _write_entry(
     entry["definition"] = "NXtomo"
     put(entry, SPLIT, is_test.astype(np.uint8))
     data = _write_instrument(_group(entry, "instrument", "NXinstrument"), exposures, raw)
-    _write_sample(_group(entry, "sample", "NXsample"), exposures)
+    sample, rotations = _group(entry, "sample", "NXsample"), exposures.views.rotations
+    sample["name"] = "sample"
+    put(sample, "view_rotation", rotations)
+    # R(θ) is nearest to R where tr(R(θ)ᵀ R) = cos θ (R00 + R22) + sin θ (R02 - R20) is largest.
+    theta = np.arctan2(rotations[:, 0, 2] - rotations[:, 2, 0], rotations[:, 0, 0] + rotations[:, 2, 2])
+    _put(sample, "rotation_angle", np.rad2deg(theta), "deg")
+    _put(sample, "time", exposures.time, "s")
     _write_process(_group(entry, "process", "NXprocess"), provenance)
     plot = _group(entry, "data", "NXdata", signal="data", axes=["rotation_angle", ".", "."])
     for source in (DATA_NAMES[0], IMAGE_KEY, ANGLES[0]):
@@ -191,16 +196,6 @@ def _write_instrument(instrument: h5py.Group, exposures: Exposures, raw: RawLayo
         _put(detector, CONE.rsplit("/", 1)[1], views.sources, "m")
     _put(detector, "psf_sigma", exposures.psf_sigma_px, "px")
     return data
-
-
-def _write_sample(sample: h5py.Group, exposures: Exposures) -> None:
-    sample["name"] = "sample"
-    rotations = exposures.views.rotations
-    put(sample, "view_rotation", rotations)
-    # R(θ) is nearest to R where tr(R(θ)ᵀ R) = cos θ (R00 + R22) + sin θ (R02 - R20) is largest.
-    theta = np.arctan2(rotations[:, 0, 2] - rotations[:, 2, 0], rotations[:, 0, 0] + rotations[:, 2, 2])
-    _put(sample, "rotation_angle", np.rad2deg(theta), "deg")
-    _put(sample, "time", exposures.time, "s")
 
 
 def _write_process(process: h5py.Group, provenance: dict[str, str]) -> None:

@@ -167,8 +167,7 @@ def size_of(whole: np.ndarray) -> int:
 
 
 def write_object(path: Path, obj: Stored, marks: Mapping[str, str] = MappingProxyType({})) -> None:
-    """Write an Object: attributes `format`, `kind`, `state` (JSON) and `marks`, and a dataset for each of its
-    tensors."""
+    """Write an Object: the attributes `format`, `kind`, `state` (JSON) and `marks`, and a dataset for each tensor."""
     with _new_object(path, obj, FORMAT, marks) as (file, tensors):
         for name, tensor in tensors.items():
             put(file, name, tensor.detach().cpu().numpy())
@@ -293,8 +292,7 @@ MOST_OBJECTS = 100_000
 
 
 def write_series(path: Path, objects: Mapping[str, Stored], steps: Steps) -> None:
-    """Write 1 to `MOST_OBJECTS` objects by their names, in this order, into one compact file, as near as `steps`
-    say."""
+    """Write 1 to `MOST_OBJECTS` objects by their names, in this order, into one compact file, as `steps` say."""
     require(0 < len(objects) <= MOST_OBJECTS, f"a series needs 1 to {MOST_OBJECTS} objects, but has {len(objects)}.")
     first, order, text = dict[str, Whole](), None, ""
     with new_hdf5(path) as file:

@@ -143,8 +143,7 @@ def write_ome_zarr(
 
 
 def read_ome_zarr(path: Path) -> Stored:
-    """The finest volume of an OME-Zarr folder of `write_ome_zarr`. Errors: `InputError` without the package zarr, and
-    for other folders."""
+    """The finest volume of an OME-Zarr folder of `write_ome_zarr`; `InputError` without zarr, and for other folders."""
     zarr = require_zarr()
     require(path.is_dir(), f"{path} must be a folder of OME-Zarr, but there is none; check the path.")
     with undamaged(path, "an OME-Zarr of δ and β, as `holosplat export` writes it"):
@@ -182,8 +181,7 @@ def halved(values: np.ndarray) -> np.ndarray:
 
 
 def metadata(grid: Grid, levels: int, limits: np.ndarray, of: Contents = REFRACTION) -> dict[str, Any]:
-    """The metadata of OME-Zarr: axes, units, scales, places, and the look of channels with the least and greatest
-    values `limits` [2, 2]."""
+    """The metadata of OME-Zarr: axes, units, places, and channels with the extreme values `limits` [2, 2]."""
     axes = [{"name": "c", "type": "channel"}]
     axes += [{"name": name, "type": "space", "unit": "micrometer"} for name in "zyx"]
     size, origin = (np.array(v[::-1]) * MICROMETRES for v in (grid.voxel_size, grid.origin))

@@ -86,8 +86,7 @@ def _head(grid: Grid, of: Contents) -> bytes:
 
 
 def read_vti(path: Path) -> Stored:
-    """The volume of a .vti file with point data delta and beta and field data length_unit. Errors: `InputError` for
-    damaged files and other image data."""
+    """The volume of a .vti file with point data delta, beta and field data length_unit; `InputError` for others."""
     from vtkmodules.vtkIOXML import vtkXMLImageDataReader
 
     _require_honest(path)
@@ -100,9 +99,8 @@ def read_vti(path: Path) -> Stored:
     data, unit = image.GetPointData(), image.GetFieldData().GetAbstractArray(UNIT)
     of = contents_of(_names(data))
     arrays = [data.GetArray(name) for name in of.units]
-    count = image.GetNumberOfPoints()
-    whole = (one and (one.GetNumberOfComponents(), one.GetNumberOfTuples()) == (1, count) for one in arrays)
-    if unit is None or unit.GetNumberOfValues() != 1 or not all(whole):
+    sizes = [None if one is None else (one.GetNumberOfComponents(), one.GetNumberOfTuples()) for one in arrays]
+    if unit is None or unit.GetNumberOfValues() != 1 or sizes != [(1, image.GetNumberOfPoints())] * 2:
         raise InputError(
             f"{path} must have the point data delta and beta, a number a point, and the field data {UNIT}, as "
             f"`holosplat export` writes them, but it has the point data {_names(data)} and the field data "
@@ -184,8 +182,8 @@ class TimeStep:
 
 
 def write_pvd(path: str | Path, steps: Sequence[TimeStep]) -> None:
-    """Write the collection `path` of `steps`, with files relative to its folder; `InputError` for a time that is not
-    finite, and for legacy files."""
+    """Write the collection `path`, with files relative to its folder; `InputError` for infinite times and legacy
+    files."""
     folder = Path(path).resolve().parent
     lines = ['<?xml version="1.0"?>', '<VTKFile type="Collection" version="0.1">', "  <!-- timestep in seconds -->"]
     lines.append("  <Collection>")
@@ -292,8 +290,7 @@ def find_snapshots(
 
 
 def seeming_snapshots(paths: Sequence[Path]) -> int:
-    """How many snapshots mesh files seem to be of by their names: two bodies or more, each with all the numbers; else
-    1."""
+    """How many snapshots the names of mesh files say: of two bodies or more, each with all the numbers; else 1."""
     numbers: dict[str, set[int]] = {}
     for file in mesh_files(paths):
         if (match := NUMBERED.fullmatch(file.stem)) is None:

@@ -170,13 +170,8 @@ def _vector(numbers: list[float]) -> str:
     return f"({','.join(map(repr, numbers))})"
 
 
-def read_nrrd(path: Path) -> Stored:
-    """The volume of NAME.nrrd and NAME.beta.nrrd: float or double, raw or gzip, axes not turned; `InputError` for other
-    files."""
-    return read_both(path, _read_one_nrrd)
-
-
-def _read_one_nrrd(path: Path) -> tuple[np.ndarray, Grid, Contents]:
+def read_nrrd(path: Path) -> tuple[np.ndarray, Grid, Contents]:
+    """One array of NRRD: float or double, raw or gzip, axes not turned; `InputError` for other files."""
     with path.open("rb") as file:
         head, found, _ = file.read(LONGEST).partition(b"\n\n")
     require(
@@ -280,13 +275,8 @@ def write_mrc(path: Path, obj: Object, grid: Grid, on_progress: Advance, of: Con
     write_both(path, head, obj, grid, on_progress, of)
 
 
-def read_mrc(path: Path) -> Stored:
-    """The volume of NAME.mrc and NAME.beta.mrc, single volumes of float32, lengths to seven digits; `InputError` for
-    others."""
-    return read_both(path, _read_one_mrc)
-
-
-def _read_one_mrc(path: Path) -> tuple[np.ndarray, Grid, Contents]:
+def read_mrc(path: Path) -> tuple[np.ndarray, Grid, Contents]:
+    """One array of MRC2014, of float32, lengths to seven digits; `InputError` for other files."""
     with path.open("rb") as file:
         raw = file.read(HEADER.itemsize).ljust(HEADER.itemsize, b"\0")
     head = np.frombuffer(raw, HEADER)[0]

@@ -58,23 +58,18 @@ class Command:
 
     _hashed: dict[tuple[Path, ...], dict[str, Any]] = field(default_factory=dict)
 
-    def _fingerprints(self, near: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
-        """The inputs with their hashes at the first written file, but for folders that hold `near`."""
+    def record(self, near: Path) -> dict[str, Any]:
+        """What is said of this command in the folder `near`, from which inputs are named, too."""
+        inputs, home = [], Path.home()
         for _, group in groupby(self.inputs, key=lambda one: one[0]):
             paths = [path for _, path in group if Path(os.path.realpath(path)) not in (near, *near.parents)]
             for few in [(path,) for path in paths] if len(paths) <= MOST_NAMED else [(*paths,)]:
-                if few not in self._hashed:
+                if few not in self._hashed:  # as they were when the first file was written
                     self._hashed[few] = ({"files": len(few)} if len(few) > 1 else {}) | fingerprint(*few)
-                yield next(iter(few)), self._hashed[few]
-
-    def record(self, near: Path) -> dict[str, Any]:
-        """What is said of this command in the folder `near`, from which inputs are named, too."""
-        inputs = []
-        for path, said in self._fingerprints(near):
-            place, home = Path(os.path.abspath(self.folder / path)), Path.home()
-            names_home = home in place.parents and home not in (near, *near.parents)  # as the way from `near` would
-            relative = {} if names_home else {"relative": os.path.relpath(place, near)}
-            inputs.append({"path": home_safe(str(path)), **relative, **said})
+                place = Path(os.path.abspath(self.folder / few[0]))
+                names_home = home in place.parents and home not in (near, *near.parents)  # as the way from `near` would
+                relative = {} if names_home else {"relative": os.path.relpath(place, near)}
+                inputs.append({"path": home_safe(str(few[0])), **relative, **self._hashed[few]})
         words = " ".join(map(_quoted, ["holosplat", *self.words]))
         said = {"command": words, "folder": home_safe(str(self.folder)), "inputs": inputs}
         return {**_program(), **said, **({"decided": self.decided} if self.decided else {})}

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -14,12 +14,9 @@ from ..checks import UnsaidError, in_range, note, require
 from ..divided_light import DividedLight
 from ..geometry import Views, rotation_y
 from ..preprocess.pixels import mean_frame
-from ..scan import DISTANCE_RANGE_M, PIXEL_RANGE_M, Exposures, checked_distance
+from ..scan import DISTANCE_RANGE_M, PIXEL_RANGE_M, Exposures, Scan, checked_distance
 from ..units import BEAM_RANGE_KEV
 from .stacks import ImageStack
-
-if TYPE_CHECKING:
-    from ..scan import Scan
 
 PROJECTION, FLAT, DARK, INVALID = range(4)
 
@@ -203,8 +200,8 @@ def magnified(
 
 
 def with_rays(views: Views, source: float | None) -> Views:
-    """The views with the rays of a point source [m] before the sample (None: far away), where the tangent of half their
-    cone's angle is above `WIDEST`."""
+    """The views with the rays of a point source [m] before the sample, if these are a wide cone (`WIDEST`); None: far
+    away."""
     if source is None or 0.5 * float(views.fields.max()) <= WIDEST * source:
         return views
     return replace(views, sources=np.full(len(views), source))
@@ -273,8 +270,8 @@ def exposures_of(
 
 
 def together(label: str, parts: Sequence[tuple[int, Stack | None]]) -> tuple[tuple[Stack, ...], np.ndarray]:
-    """Stacks of one kind each, and the kinds [N] of all their frames; `InputError` for stacks that are not [n, H, W] or
-    differ in size."""
+    """Stacks of one kind each, and the kinds [N] of all frames; `InputError` for stacks that are not [n, H, W]
+    alike."""
     stacks: list[Stack] = []
     kinds: list[int] = []
     for kind, stack in parts:

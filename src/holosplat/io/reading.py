@@ -56,15 +56,15 @@ class Told:
     angles: Path | None = None
     """Text file of the frames' angles [degrees]: one a line, or a named column (default: as the files say)."""
     exposures: Path | None = None
-    """geometry.toml of the beams, as align and calibrate write it, which goes before what files say: a view for each
-    frame, or for each frame of every time (default: as the files say)."""
+    """geometry.toml of align or calibrate, which overrides the files: a view for each frame, or for each frame of every
+    time (default: as the files say)."""
     flats: Path | None = None
     """Images without the object: TIFF, PNG, HDF5, .npy or .npz, or a folder of images (default: the files' own)."""
     darks: Path | None = None
     """Images without light, likewise."""
     leave_out: str | None = None
-    """Frames to leave out, flats and darks too, counted from 0 as they stand in the files, as --views; those of --flats
-    and --darks follow (default: flats and darks that are unlike the others)."""
+    """Frames to leave out, counted from 0 in the files, as --views; those of --flats and --darks follow (default: odd
+    flats and darks)."""
     files: str | None = None
     """Of a folder of images: the names of the projections, such as 'raw_*.tif' (default: all but flat* and dark*)."""
     entry: str | None = None
@@ -86,16 +86,15 @@ class Told:
     tube: str | None = None
     """Tube about the axis to divide out, INNER:OUTER:ATTENUATION: diameters [m] and µ [1/m], as in 4e-3:4.5e-3:200."""
     wall: str | None = None
-    """What matter lies in, which is then part of the model: tube:INNER:OUTER:MATERIAL:FILLING (diameters [m]), or
-    cuvette: (WIDTHxDEPTH each), or slab:INNER:MATERIAL:FILLING beyond the field, such as tube:4e-5:5e-5:glass:water."""
+    """Container, modelled with the matter: tube:INNER:OUTER:MATERIAL:FILLING (diameters [m]), cuvette: (WIDTHxDEPTH
+    each), or slab:INNER:MATERIAL:FILLING beyond the field; for instance tube:4e-5:5e-5:glass:water."""
     black: Signed | None = None
     """Grey images, nerf-synthetic: intensity of black pixels, relative to the flat field (default: 0)."""
     white: Signed | None = None
     """Grey images, nerf-synthetic: intensity of white pixels, relative to the flat field (default: 1)."""
 
     def energy(self) -> float | str | None:
-        """The photon energy [keV], or its range, also by the wavelength; `InputError` for both, and for no energy of
-        X-rays."""
+        """The photon energy [keV], or its range, also by the wavelength; `InputError` for both, and beyond X-rays."""
         if isinstance(self.energy_kev, float | int):
             from ..scan import ENERGY_RANGE_KEV  # needs geometry, which reading an option does not
 
@@ -220,24 +219,18 @@ class Part:
 
         Errors: `InputError` for frames, rows, columns or times that the scan does not have.
         """
-        scan = self._chosen(at_time(self._timed(scan), self.time_frame))
-        if self.crop is not None:
-            scan = scan.cropped(*_corner(self.crop, scan.views.shape))
-        return scan.binned(self.bin)
-
-    def _timed(self, scan: Scan) -> Scan:
-        if self.time_frames is None:
-            return scan
-        instants = scan.instants
-        kept = instants[marked("--time-frames", self.time_frames, len(instants))]
-        return scan[np.flatnonzero(np.isin(scan.exposures.time, kept))]
-
-    def _chosen(self, scan: Scan) -> Scan:
+        if self.time_frames is not None:
+            kept = scan.instants[marked("--time-frames", self.time_frames, len(scan.instants))]
+            scan = scan[np.flatnonzero(np.isin(scan.exposures.time, kept))]
+        scan = at_time(scan, self.time_frame)
         taken = np.ones(len(scan), dtype=bool) if self.views is None else marked("--views", self.views, len(scan))
         if self.test_views is not None:
             held_out = marked("--test-views", self.test_views, len(scan))
             scan, taken = scan.with_split(held_out), taken | held_out
-        return scan if taken.all() else scan[np.flatnonzero(taken)]
+        scan = scan if taken.all() else scan[np.flatnonzero(taken)]
+        if self.crop is not None:
+            scan = scan.cropped(*_corner(self.crop, scan.views.shape))
+        return scan.binned(self.bin)
 
 
 @dataclass(frozen=True)
@@ -289,8 +282,7 @@ class Reading:
 
 
 def told_energy(energy: float | str | None, wavelength: float | None, index: float | None) -> float | str | None:
-    """The photon energy [keV] of --energy-kev, or of --wavelength and --medium-index; `InputError` for both, and for an
-    index alone."""
+    """The photon energy [keV] by energy or wavelength and index; `InputError` for both, and for an index alone."""
     if wavelength is None:
         require(index is None, "--medium-index needs --wavelength, which is shorter in the medium; give both.")
         return energy
@@ -339,8 +331,7 @@ def _corner(text: str, shape: tuple[int, int]) -> tuple[slice, slice]:
 
 
 def marked(option: str, text: str, count: int) -> np.ndarray:
-    """[count] bool: what the `text` of an option names, numbers and ranges with commas; `InputError` for what is not
-    there."""
+    """[count] bool: the numbers and ranges, with commas, in the `text` of an option; `InputError` for others."""
     found = np.zeros(count, dtype=bool)
     for part in text.split(","):
         if ":" in part:

@@ -19,8 +19,8 @@ def machine_memory() -> int:
 
 
 def free_memory() -> int:
-    """Bytes of memory that this process can still take: what is available on the machine, and what its control group
-    (a container, a cluster's job) and its address space (`ulimit -v`) have left. At least 0."""
+    """Bytes of memory that the machine, control group and address space (`ulimit -v`) leave this process; at least
+    0."""
     left = [*_left(_groups()), *_left(_address_space())]
     return max(0, min([1024 * _entry(PROC / "meminfo", "MemAvailable:") or _physical(), *left]))
 

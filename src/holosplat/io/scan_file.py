@@ -104,8 +104,18 @@ def open_scan(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Iterator[
 
 
 def _scan_group(file: h5py.File, path: Path, wanted: str | None) -> h5py.Group:
-    """The group of the scan: the one that is `wanted`, or /entry, or the file's default or only one with frames."""
-    found = _scans_in(file)
+    """The group of the scan: the one that is `wanted`, or /entry, or the file's default or only one with frames, at the
+    top of the file or one below, as Diamond has them."""
+
+    def holds_frames(item: Any) -> bool:
+        return isinstance(item, h5py.Group) and any(isinstance(item.get(n), h5py.Dataset) for n in DATA_NAMES)
+
+    found = list[str]()
+    for name, group in file.items():
+        if holds_frames(group):
+            found.append(name)
+        elif isinstance(group, h5py.Group):
+            found += [f"{name}/{inner}" for inner, item in group.items() if holds_frames(item)]
     if wanted is not None:
         group = file.get(wanted)
         if not isinstance(group, h5py.Group):
@@ -121,21 +131,6 @@ def _scan_group(file: h5py.File, path: Path, wanted: str | None) -> h5py.Group:
         f"{path} must hold the group /entry (NeXus NXtomo), but it holds {', '.join(file) or 'nothing'}; frames are "
         f"looked for as {' or '.join(DATA_NAMES)} in a group, or a group in that."
     )
-
-
-def _scans_in(file: h5py.File) -> list[str]:
-    """The groups that hold frames: at the top of the file, or one below, as Diamond has them."""
-
-    def holds_frames(item: Any) -> bool:
-        return isinstance(item, h5py.Group) and any(isinstance(item.get(n), h5py.Dataset) for n in DATA_NAMES)
-
-    found = []
-    for name, group in file.items():
-        if holds_frames(group):
-            found.append(name)
-        elif isinstance(group, h5py.Group):
-            found += [f"{name}/{inner}" for inner, item in group.items() if holds_frames(item)]
-    return found
 
 
 def _frame_kinds(fields: Fields) -> np.ndarray:

@@ -92,8 +92,8 @@ def _has_begun(raw: IO[bytes]) -> bool:
 
 
 def _unpacked(packed: bytes, length: int, most: int) -> np.ndarray | None:
-    """The ranges of a file of `length` bytes, `most` bytes of them at most; None where they are damaged, or none that
-    such a file has: they hold something, one comes after the other, and all lie in the file."""
+    """The ranges in a seal of a file of `length` bytes, unpacked to `most` bytes; None if they cannot be of such a
+    file."""
     try:
         unpacker = zlib.decompressobj()
         values = np.frombuffer(unpacker.decompress(packed, most), dtype="<i8").reshape(-1, 2)

@@ -106,8 +106,7 @@ class _Glb:
         targets: np.ndarray | Sequence[np.ndarray] = (),
         weights: np.ndarray | Sequence[float] = (),
     ) -> None:
-        """A body of `vertices` [P, 3] [m] of matter with `constants`, with morph `targets` [K, P, 3] [m] and the
-        `weights` [K] it begins with."""
+        """Add a body: vertices [P, 3] [m], constants of its matter, morph targets [K, P, 3] [m], first weights [K]."""
         self.constants += [] if constants in self.constants else [constants]
         material = self.constants.index(constants)
         primitive: dict[str, Any] = {"attributes": {"POSITION": self._places(vertices)}, "material": material}

@@ -155,10 +155,9 @@ def open_tiff(file: Path) -> Iterator[Any]:
 
 
 def image_numbers(opened: Any, file: Path) -> list[int]:
-    """The numbers of the images of an open TIFF file: its pages, without smaller copies of others, or, where there is
-    one page, the planes behind it (ImageJ writes large stacks so). Errors: `InputError` for pages that run in a circle
-    or beyond its end, and for fewer planes than ImageJ declares."""
-    places, whole, following = set[int](), list[int](), 0
+    """The numbers of an open TIFF file's images: whole pages, or planes behind the only page (as of ImageJ). Errors:
+    `InputError` for pages in a circle or beyond the end, and for missing planes."""
+    places, whole, following, tiff = set[int](), list[int](), 0, opened.tiff  # tifffile leaves pages beyond the end
     while True:
         try:
             page = opened.pages[len(places)]
@@ -167,22 +166,15 @@ def image_numbers(opened: Any, file: Path) -> list[int]:
         require(page.offset not in places, f"{file} must hold its pages one after another, but they run in a circle.")
         places.add(page.offset)
         whole += [] if page.is_reduced and whole else [len(places) - 1]
-        following = _next_page(opened, page)
+        opened.filehandle.seek(page.offset)
+        (tags,) = struct.unpack(tiff.tagnoformat, opened.filehandle.read(tiff.tagnosize))
+        opened.filehandle.seek(page.offset + tiff.tagnosize + tags * tiff.tagsize)
+        (following,) = struct.unpack(tiff.offsetformat, opened.filehandle.read(tiff.offsetsize))
     require(following == 0, f"{file} must hold its pages whole, but the one after {len(places)} is not; save it anew.")
     if len(whole) == 1:
         return list(range(_planes(opened, file)))
     samples = _samples(opened.pages[0])
     return [page * samples + sample for page in whole for sample in range(samples)]
-
-
-def _next_page(opened: Any, page: Any) -> int:
-    """Where the page after `page` begins [bytes]; 0 for none. tifffile leaves pages beyond the end of a file."""
-    tiff, handle = opened.tiff, opened.filehandle
-    handle.seek(page.offset)
-    (tags,) = struct.unpack(tiff.tagnoformat, handle.read(tiff.tagnosize))
-    handle.seek(page.offset + tiff.tagnosize + tags * tiff.tagsize)
-    (found,) = struct.unpack(tiff.offsetformat, handle.read(tiff.offsetsize))
-    return int(found)
 
 
 def _samples(page: Any) -> int:

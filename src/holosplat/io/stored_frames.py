@@ -1,5 +1,4 @@
-"""Projections of raw files, flat-field corrected and mended when they are read; flats and darks in files of their own
-(--flats, --darks), and frames that have no data; which frames of a file count."""
+"""Projections of raw files, corrected and mended when they are read; flats and darks beside; frames without data."""
 
 from __future__ import annotations
 
@@ -59,34 +58,29 @@ def light_frames(path: Path, names: str, key: int) -> ImageStack | DatasetStack 
     """
     if path.is_file() and h5py.is_hdf5(path):
         with open_hdf5(path) as file:
-            return _dataset_stack(path, file, names, key)
+            found: dict[str, h5py.Dataset] = {}
+
+            def take(name: str, item: Any) -> None:
+                is_array = isinstance(item, h5py.Dataset) and item.ndim in (2, 3) and item.dtype.kind in "iuf"
+                if is_array and min(item.shape) > 0:
+                    found[name] = item
+
+            file.visititems(take)  # each dataset once, whatever links lead to it
+            dataset = found[name := _chosen(path, found, names)]
+            count = len(dataset) if dataset.ndim == 3 else 1
+            numbers, beside = np.arange(count), cast(h5py.Group, dataset.parent)
+            keys = next((beside[k] for k in KEYS if k in beside), None)
+            if isinstance(keys, h5py.Dataset) and keys.shape == (count,):
+                marks = np.asarray(keys)
+                numbers = next((n for mark in (key, 0) if len(n := np.flatnonzero(marks == mark))), numbers)
+            require_filled(dataset, f"{path}: /{name}", np.isin(np.arange(count), numbers))
+            return DatasetStack(path, name, tuple(numbers.tolist()), (len(numbers), *dataset.shape[-2:]))
     if path.suffix.lower() == ".npz" and path.is_file():
         arrays = read_archive(path).items()
         frames = {name: array for name, array in arrays if array.ndim in (2, 3) and array.dtype.kind in "iuf"}
         array = frames[_chosen(path, frames, names)]
         return array.reshape(-1, *array.shape[-2:])
     return stack_of(path)
-
-
-def _dataset_stack(path: Path, file: h5py.File, names: str, key: int) -> DatasetStack:
-    found: dict[str, h5py.Dataset] = {}
-
-    def take(name: str, item: Any) -> None:
-        if isinstance(item, h5py.Dataset) and item.ndim in (2, 3) and item.dtype.kind in "iuf" and min(item.shape) > 0:
-            found[name] = item
-
-    file.visititems(take)  # each dataset once, whatever links lead to it
-    name = _chosen(path, found, names)
-    dataset = found[name]
-    shape = (len(dataset) if dataset.ndim == 3 else 1, *dataset.shape[-2:])
-    numbers = np.arange(shape[0])
-    beside = cast(h5py.Group, dataset.parent)
-    keys = next((beside[k] for k in KEYS if k in beside), None)
-    if isinstance(keys, h5py.Dataset) and keys.shape == (shape[0],):
-        marks = np.asarray(keys)
-        numbers = next((n for mark in (key, 0) if len(n := np.flatnonzero(marks == mark))), numbers)
-    require_filled(dataset, f"{path}: /{name}", np.isin(np.arange(shape[0]), numbers))
-    return DatasetStack(path, name, tuple(numbers.tolist()), (len(numbers), shape[1], shape[2]))
 
 
 def _chosen(path: Path, found: Mapping[str, Any], names: str) -> str:

@@ -58,10 +58,6 @@ class Table:
             raise InputError(f"{self.label(name)} must hold numbers, but it is {shown(value)}.")
         return finite(self.label(name), shaped(self.label(name), array.astype(np.float64), shape))
 
-    def count(self, name: str) -> int:
-        """A whole number, not negative."""
-        return self.counts(name, ())[0]
-
     def counts(self, name: str, shape: tuple[int, ...]) -> tuple[int, ...]:
         """Whole numbers, none of them negative."""
         numbers = self.numbers(name, shape).reshape(-1)
@@ -169,14 +165,15 @@ def read_exposures(beam: Table, frames: Sequence[Table], shape: tuple[int, int])
         raise InputError(f"{beam.path}: {error}") from None
 
 
-def in_order(head: Table, entries: Sequence[Table]) -> np.ndarray:
-    """[N] int: the entry of each frame of the scan, by their `index`: 0 … `count` - 1, each once."""
-    found = np.array([entry.number("index") for entry in entries])
-    count = head.count("count")
+def read_own_exposures(head: Table, frames: Sequence[Table], shape: tuple[int, int]) -> tuple[np.ndarray, Exposures]:
+    """The number [N] of each frame of the scan among `frames` of our own, by their `index`, and the exposures."""
+    entries = [frame.table("holosplat") for frame in frames]
+    found, count = np.array([entry.number("index") for entry in entries]), head.counts("count", ())[0]
     good = np.array_equal(np.sort(found), np.arange(count))
     where = entries[0].label("index")
     require(good, f"{where} and the others must be 0 to {count - 1}, each once, but they are {found.tolist()}.")
-    return np.argsort(found)
+    order = np.argsort(found)
+    return order, read_exposures(head, [entries[k] for k in order], shape)
 
 
 _NUMBERS = (("energy_kev", None), ("distance_m", None), ("psf_sigma_px", 0.0), ("time_s", 0.0), ("bandwidth", 0.0))

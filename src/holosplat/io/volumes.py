@@ -185,8 +185,7 @@ def write_voxels(
     of: Contents = REFRACTION,
     beside: Beside = ALONE,
 ) -> None:
-    """Write `obj` voxelised on `grid`, at most `SLAB_VOXELS` voxels at a time; `on_progress(fraction)` is called after
-    each slab."""
+    """Write `obj` on `grid`, `SLAB_VOXELS` voxels at a time; `on_progress(fraction)` is called after each slab."""
     write_slabs(path, grid, slabs_of(obj, grid, slab_rows(grid), on_progress), of, beside)
 
 
@@ -232,8 +231,8 @@ OF, VIEWS, COPIES = "of", "views", "copies"
 
 
 def write_guess(path: Path, volume: Volume, spread: np.ndarray | None, of_copies: bool = False) -> None:
-    """Write δ and β that were guessed, as `write_volume` has them, and beside them /spread [Z, Y, X], the standard
-    deviation of occupancy, where there is one; of_copies: in guesses of copies of the scene."""
+    """Write guessed δ and β as `write_volume` does, and /spread [Z, Y, X], the deviation of occupancy (of copies or
+    views)."""
     with new_hdf5(path, 12 * volume.delta.size) as file:
         file.attrs.update({"voxel_size": np.array(volume.grid.voxel_size), "origin": np.array(volume.grid.origin)})
         for name in NAMES:

@@ -178,8 +178,7 @@ def of_surfaces(exposures: Exposures, how: SurfaceOptions) -> Needs:
 
 
 def of_export(shape: tuple[int, int, int], suffix: str) -> Needs:
-    """What `export --volume` takes for δ and β on so many voxels, in a file or folder of this suffix: TIFF is written
-    whole, others slab by slab, and OME-Zarr at lower resolutions, too, by rows of chunks."""
+    """What `export --volume` takes: TIFF is written whole, others by slabs, OME-Zarr by rows of chunks, too."""
     voxels = math.prod(shape)
     slab, chunks = (
         min(voxels, max(rows, shape[0] * shape[2])) for rows in (SLAB_VOXELS, 2 * CHUNK * shape[0] * shape[2])

@@ -162,7 +162,10 @@ def visibility(subject: Subject, setup: Setup) -> Visibility:
     raster = _raster(subject, setup)
     added = subject.contrast(setup.energy_kev)
     thickness, intensity = _frame(subject, setup, added, raster)
-    contrast = _seen_by_pixels(intensity - 1, 1 / raster.factor)
+    # The pixel about each sample averages by its transfer function `sinc(p fx) sinc(p fy)`.
+    frequencies = np.fft.fftfreq(raster.count), np.fft.rfftfreq(raster.count)
+    rows, columns = (np.sinc(raster.factor * f) for f in frequencies)
+    contrast = np.fft.irfft2(np.fft.rfft2(intensity - 1) * rows[:, None] * columns, s=intensity.shape)
     blocks, f = raster.count // raster.factor, raster.factor
     signal = signal_to_noise_squared(contrast)
     thickest, k = float(thickness.max()), wavenumber(setup.energy_kev)
@@ -231,14 +234,6 @@ def _frame(subject: Subject, setup: Setup, added: DeltaBeta, raster: _Raster) ->
     intensity = instrument.frames(LineIntegrals(depth[:, None], ((added.delta, added.beta),)))[0].numpy()
     my, mx = instrument.margin
     return depth[0, my : my + raster.count, mx : mx + raster.count].numpy(), intensity
-
-
-def _seen_by_pixels(image: np.ndarray, frequency_scale: float) -> np.ndarray:
-    """`image` [n, n] averaged over the square pixel about each sample, `frequency_scale` of a pixel, by `sinc(p fx)
-    sinc(p fy)`."""
-    n = len(image)
-    rows, columns = (np.sinc(f / frequency_scale) for f in (np.fft.fftfreq(n), np.fft.rfftfreq(n)))
-    return np.fft.irfft2(np.fft.rfft2(image) * rows[:, None] * columns, s=image.shape)
 
 
 def _spread(signal: np.ndarray, pitch: float) -> float:

@@ -61,13 +61,6 @@ class Recording:
                 f"of one frame at {self.frame_rate:g} Hz.",
             )
 
-    @property
-    def light_time(self) -> float | None:
-        """Time with light in one frame [s]: the exposure, or else the frame; None if neither is known."""
-        if self.exposure is not None:
-            return self.exposure
-        return None if self.frame_rate is None else 1 / self.frame_rate
-
 
 @dataclass(frozen=True)
 class Waves:
@@ -238,7 +231,8 @@ def _motion(setup: Setup, recording: Recording) -> Motion:
     if recording.velocity is None:
         return Motion(None, None, None, None)
     pixels_a_second = recording.velocity / setup.pixel_size
-    time, rate = recording.light_time, recording.frame_rate
+    rate = recording.frame_rate
+    time = recording.exposure or (1 / rate if rate else None)  # with light in one frame
     blur = None if time is None else pixels_a_second * time
     step = None if rate is None else pixels_a_second / rate
     return Motion(blur, step, 1 / pixels_a_second, pixels_a_second)

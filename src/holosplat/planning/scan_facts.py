@@ -292,7 +292,13 @@ BINNINGS, FEWEST_COLUMNS = range(2, 9), 11
 
 def smaller(exposures: Exposures, method: Method, matter: MatterKind | None) -> Iterator[tuple[str, Needs]]:
     """The same reconstruction on larger voxels in the start, and on larger pixels; how, and what it takes then."""
-    flag, coarse = _one_voxel_a_pixel(method)
+    flag, coarse = "", method  # none where the method has no such start
+    start = getattr(method, "volume", None)
+    if isinstance(start, HolographicTV) and isinstance(method, Gaussians | HolographicVoxels | Voxels | NeuralFields):
+        flag, coarse = "--set volume.refine=1", replace(method, volume=replace(start, refine=1))
+    elif isinstance(method, Auto | Surfaces):
+        gaussians = replace(method.gaussians, volume=replace(method.gaussians.volume, refine=1))
+        flag, coarse = "--set gaussians.volume.refine=1", replace(method, gaussians=gaussians)
     for factor in (1, *BINNINGS):
         if factor > 1 and exposures.views.shape[1] // factor < FEWEST_COLUMNS:
             return
@@ -309,15 +315,3 @@ def coarser(exposures: Exposures, of: Callable[[Exposures], Needs]) -> Iterator[
         if exposures.views.shape[1] // factor < FEWEST_COLUMNS:
             return
         yield f"--bin {factor}", of(on_larger_pixels(exposures, factor))
-
-
-def _one_voxel_a_pixel(method: Method) -> tuple[str, Method]:
-    """A method whose start has voxels of one pixel, and the flag that makes it so; none where it has no such start."""
-    start = getattr(method, "volume", None)
-    if isinstance(start, HolographicTV) and isinstance(method, Gaussians | HolographicVoxels | Voxels | NeuralFields):
-        return "--set volume.refine=1", replace(method, volume=replace(start, refine=1))
-    if isinstance(method, Auto | Surfaces):
-        gaussians = method.gaussians
-        coarse = replace(gaussians, volume=replace(gaussians.volume, refine=1))
-        return "--set gaussians.volume.refine=1", replace(method, gaussians=coarse)
-    return "", method

@@ -77,7 +77,12 @@ def shown(obj: Stored) -> Shown:
     `InputError` without one."""
     with torch.no_grad():
         if isinstance(obj, GaussianCloud):
-            return _splats(obj)
+            unit, turns = obj.unit_length, Rotation.from_quat(obj.quaternions.double().numpy()[:, [1, 2, 3, 0]])
+            axes = turns.as_matrix() * (unit * obj.scales.double().numpy())[:, None, :]
+            centres = unit * obj.centres.double().numpy()
+            depth = (centres[:, 2] - centres[:, 2].min()) / max(float(np.ptp(centres[:, 2])), 1e-30)
+            colours = np.array(NEAR) + depth[:, None] * (np.array(FAR) - np.array(NEAR))
+            return Splats(centres, axes @ axes.transpose(0, 2, 1), colours, opacities(obj, DEPTH))
         if isinstance(obj, SurfaceMesh):
             return obj.mesh()
         grid = obj.enclosing_grid(MOST_VOXELS)
@@ -86,8 +91,8 @@ def shown(obj: Stored) -> Shown:
 
 
 def at_times(obj: Stored, times: Sequence[float]) -> dict[str, Stored]:
-    """What the slider of time leads through, by its label: a moving object at up to `TIMES` of `times` [s], or from the
-    first of its basis to the last where there are none; any other object alone."""
+    """Objects by labels of the time slider: a moving one at up to `TIMES` of `times` [s] or of its basis; else
+    itself."""
     if not isinstance(obj, InMotion):
         return {"": obj}
     basis = obj.basis
@@ -136,13 +141,3 @@ def _beyond(places: np.ndarray, share: float) -> np.ndarray:
     """Which of `places` [N] stay; the farthest always does."""
     low, high = places.min(), places.max()
     return (places >= low + min(share, 1.0) * (high - low)) | (places == high)
-
-
-def _splats(cloud: GaussianCloud) -> Splats:
-    unit = cloud.unit_length
-    turns = Rotation.from_quat(cloud.quaternions.double().numpy()[:, [1, 2, 3, 0]]).as_matrix()
-    axes = turns * (unit * cloud.scales.double().numpy())[:, None, :]
-    centres = unit * cloud.centres.double().numpy()
-    depth = (centres[:, 2] - centres[:, 2].min()) / max(float(np.ptp(centres[:, 2])), 1e-30)
-    colours = np.array(NEAR) + depth[:, None] * (np.array(FAR) - np.array(NEAR))
-    return Splats(centres, axes @ axes.transpose(0, 2, 1), colours, opacities(cloud, DEPTH))
