@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,6 +17,7 @@ from ..checks import InputError, require
 from ..geometry import Grid, Views
 from ..io.atomic import require_writable
 from ..ranges import checked_dataclass
+from ..scan import Exposures
 from .options import (
     BeamlineOptions,
     MaterialOptions,
@@ -152,7 +153,6 @@ def simulate(
     from ..backends import resolve
     from ..beamline.series import held_out
     from ..beamline.simulate import Simulation
-    from ..io.nxtomo import scan_writer
     from ..planning.acts import of_simulation
 
     truth.require_usable(out)
@@ -187,14 +187,7 @@ def simulate(
     )
     recorded = {"shutter": motion.shutter(), "light": experiment.light, "backend": experiment.backend}
     how = Simulation(experiment.noise.photons_per_pixel, experiment.noise.seed, **recorded)
-    missing = specimen.matter.missing_field(true_views.views)
-    if specimen.goes_on:
-        say("the matter, or its medium, goes on beyond the field of view; the frames are made with it")
-    elif missing > 0:
-        say(
-            f"warning: the scene reaches {1e6 * missing:.3g} µm ({missing / beamline.pixel_size:.3g} pixels) beyond "
-            "the detector in at least one view; enlarge --detector, or move --origin."
-        )
+    _say_of_missing_field(specimen, true_views.views, beamline.pixel_size)
     of_poses = motion.hold_out == "views"
     split = beamline.split(len(views)) if of_poses else replace(beamline, distances=()).split(len(times))
     is_test = held_out(split, len(views), len(times), motion.hold_out)
@@ -208,12 +201,7 @@ def simulate(
     tell("the simulation", of_simulation(true_views, how.samples(true_views), len(true)), out)
     if truth.write_mesh(specimen.matter):
         say(f"wrote {truth.truth_mesh}: the true surfaces")
-    with ProgressBar() as bar, ExitStack() as stack:
-        writers = [stack.enter_context(scan_writer(path, e, is_test, facts)) for path, e, facts in targets]
-        for n, frame in enumerate(source.frames(specimen.matter, filled, true, how)):
-            for add in writers:
-                add(frame)
-            bar.show("simulating views", (n + 1) / len(is_test), {})
+    _write_frames(targets, is_test, source.frames(specimen.matter, filled, true, how))
     text = "{} frames of {} × {} pixels, {} of them held out".format(len(true), *beamline.detector, is_test.sum())
     say(f"wrote {out}: {text}{f', at {len(times)} times from {len(views)} views' if motion.frame_rate else ''}")
     if truth.true_exposures:
@@ -283,6 +271,31 @@ def _still(
     found = imaged.generated.in_field(beamline)
     goes_on = found is not None and found.goes_on
     return _Specimen(generated.scene, times, said | {"specimen_drawn": generated.text}, generated.regions, goes_on)
+
+
+def _say_of_missing_field(specimen: _Specimen, views: Views, pixel_size: float) -> None:
+    missing = specimen.matter.missing_field(views)
+    if specimen.goes_on:
+        say("the matter, or its medium, goes on beyond the field of view; the frames are made with it")
+    elif missing > 0:
+        say(
+            f"warning: the scene reaches {1e6 * missing:.3g} µm ({missing / pixel_size:.3g} pixels) beyond "
+            "the detector in at least one view; enlarge --detector, or move --origin."
+        )
+
+
+def _write_frames(
+    targets: list[tuple[Path, Exposures, dict[str, str]]], is_test: np.ndarray, frames: Iterator[np.ndarray]
+) -> None:
+    """Every frame to all `targets`, as it comes."""
+    from ..io.nxtomo import scan_writer
+
+    with ProgressBar() as bar, ExitStack() as stack:
+        writers = [stack.enter_context(scan_writer(path, e, is_test, facts)) for path, e, facts in targets]
+        for n, frame in enumerate(frames):
+            for add in writers:
+                add(frame)
+            bar.show("simulating views", (n + 1) / len(is_test), {})
 
 
 def _write_truth(path: Path, matter: Object, views: Views) -> None:

@@ -13,14 +13,12 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional
 
-from ..checks import require
 from ..io.reading import Reading, Told
 from ..progress import FitProgress, FitState
 from ..ranges import Many, Within, checked_dataclass
 from .places import Output
 
 if TYPE_CHECKING:
-    from ..representations import Stored
     from ..show.server import LiveView
     from ..workflows.run_folder import RunFolder
 
@@ -90,12 +88,13 @@ def view(what: Positional[Path], port: Port = 8080) -> None:
         what: Run folder, or object file (object.h5, or one of export --compact, of a series too).
         port: Port; the next free one is taken.
     """
+    from ..show.parts import objects_of
     from ..show.server import LiveView
     from ..workflows.run_folder import RunFolder, fitted_by
 
     folder = RunFolder(what)
     followed = what.is_dir() and fitted_by(folder) is not None
-    objects, words, slider = ({}, [], "time") if followed else _objects(what)
+    objects, words, slider = ({}, [], "time") if followed else objects_of(what)
     page = LiveView(what.resolve().name or "holosplat", port)
     try:
         if followed:
@@ -130,33 +129,6 @@ def _pause() -> None:
 def _until_interrupted() -> None:
     """Wait for Ctrl-C."""
     threading.Event().wait()
-
-
-def _objects(what: Path) -> tuple[dict[str, Stored], list[str], str]:
-    """Objects by labels of the slider (times, or a rehearsed run and likely matter), words, the slider's name."""
-    from ..io.hdf5 import open_hdf5
-    from ..io.objects import SERIES, read_object, read_series
-    from ..show.parts import at_times, likely_surfaces
-    from ..show.scene import steps_of
-    from ..workflows.reconstruction import instants_of
-    from ..workflows.rehearsal import matter_of
-    from ..workflows.run_folder import RunFolder
-
-    require(what.exists(), f"{what} must be a run folder or an object file, but there is none; check the path.")
-    if what.is_dir():
-        folder = RunFolder(what)
-        folder.require_run()
-        obj, matter = folder.read_result(), matter_of(folder)
-        likely = {} if matter is None else likely_surfaces(matter)
-        words, slider = [obj.described, *steps_of(folder)], "shown" if likely else "time"
-        return at_times(obj, instants_of(folder)) | likely, words, slider
-    with open_hdf5(what) as file:
-        several = file.attrs.get("format", "") == SERIES
-    if several:
-        series = read_series(what)
-        return series, [f"{len(series)} objects"], "time"
-    obj = read_object(what)
-    return at_times(obj, ()), [obj.described], "time"
 
 
 def compare(

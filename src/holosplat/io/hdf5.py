@@ -20,9 +20,8 @@ from ..checks import InputError, MissingError, UnsaidError, is_of_memory, requir
 from ..units import unit_factor
 from .atomic import atomic_path
 from .guard import require_memory
-from .hdf5_guard import WRITING, filters_missing_in, opened_for_reading, require_own
+from .hdf5_guard import WRITING, filters_missing_in, opened_for_reading, require_own, require_sealed, seal, summed
 from .provenance import ATTRIBUTE, attribute
-from .seal import require_sealed, seal, summed
 
 
 @contextmanager

@@ -1,29 +1,38 @@
-"""HDF5 files that nobody vouches for: they bring their own values, not those of other files, and no more than they are.
+"""Guards of HDF5 files: they bring their own values, no more than they are, and are as they were written.
 
 A link, a virtual dataset or external storage can make a reader copy any file of this machine into what it writes.
+
+HDF5 sums up the values of chunks alone. Numbers that stand for themselves, texts, names and the index of chunks have no
+checksum, and a flipped bit in them can become another number, or crash the library. So a seal behind the end of our own
+files has the SHA-256 of all bytes that are in no such chunk; it is held against the file before the library sees it.
+Other programs pass over bytes behind the end, and a program that writes to the file cuts them off: its seal is then
+gone.
 """
 
 from __future__ import annotations
 
 import errno
+import hashlib
+import io
 import math
 import os
 import re
+import struct
 import time
 import zlib
 from collections.abc import Iterator
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import h5py
+import numpy as np
 from h5py import h5d, h5l, h5o, h5p, h5z  # pyright: ignore[reportAttributeAccessIssue]  # compiled, without stubs
 
 from ..checks import InputError, require, require_regular, warn
 from .guard import DEEPEST, SMALL, require_declared
 from .room import free_memory
-from .seal import require_sealed
 
 MOST = 200_000
 """Links in a file, at most: larger ones are no scans, and take minutes to look through."""
@@ -275,3 +284,101 @@ def _places(path: Path, name: str, prefix: str) -> Iterator[Path]:
             yield from (one for one in sorted(place.parent.glob("*")) if like.fullmatch(one.name))
         else:
             yield place
+
+
+MAGIC = b"holosplat sealed"
+"""With which a seal begins and ends."""
+ENDING = struct.Struct(f"<QQ32s{len(MAGIC)}s")
+"""Length of the HDF5 file, length of the packed ranges, SHA-256, and the seal's name."""
+START = struct.Struct("<8sB31xQ")
+"""The first bytes of an HDF5 file: its signature, the version 0 of what follows, and where it ends."""
+SIGNATURE = b"\x89HDF\r\n\x1a\n"
+BLOCK = 1 << 20
+RANGE, CHUNK = 16, 13
+"""Bytes of a range, and those that a chunk takes of the file at least: a value, its checksum, and where they are."""
+
+
+def summed(file: h5py.File) -> np.ndarray:
+    """Offsets and sizes [N, 2] of the chunks whose values have checksums, in order."""
+    file.flush()  # they have their places then
+    found: list[tuple[int, int]] = []
+
+    def take(name: str, item: h5py.Group | h5py.Dataset) -> None:
+        if isinstance(item, h5py.Dataset) and item.chunks and item.fletcher32:
+            item.id.chunk_iter(lambda one: found.append((one.byte_offset, one.size)))
+
+    file.visititems(take)
+    return np.array(sorted(found), dtype="<i8").reshape(-1, 2)
+
+
+def seal(raw: IO[bytes], ranges: np.ndarray) -> None:
+    """Put the seal behind a closed HDF5 file that is open for reading and writing."""
+    length, packed = raw.seek(0, io.SEEK_END), zlib.compress(ranges.tobytes())
+    digest = _digest(raw, length, ranges)
+    raw.seek(0, io.SEEK_END)
+    rest = memoryview(MAGIC + packed + ENDING.pack(length, len(packed), digest, MAGIC))
+    while rest:  # a file without a buffer may take a part
+        rest = rest[raw.write(rest) :]
+
+
+def require_sealed(path: Path) -> None:
+    """`InputError` for a file that is not as its seal says, or has a part of one; files without one pass."""
+    with path.open("rb") as raw:
+        good = _is_as_sealed(raw, raw.seek(0, io.SEEK_END))
+    require(good, f"{path} must be as it was written, but it is truncated or damaged; bring back the whole file.")
+
+
+def _is_as_sealed(raw: IO[bytes], size: int) -> bool:
+    """Whether a file of so many bytes is as its seal says, or has none."""
+    if size < START.size + ENDING.size:
+        return True
+    raw.seek(size - ENDING.size)
+    length, packed, digest, name = ENDING.unpack(raw.read(ENDING.size))
+    if name != MAGIC:
+        return not _has_begun(raw)
+    if length + len(MAGIC) + packed + ENDING.size != size:
+        return False
+    most = max(BLOCK, RANGE * (length // CHUNK))
+    if packed > most + most // 1000 + BLOCK:  # deflate makes nothing longer than that
+        return False
+    raw.seek(length + len(MAGIC))
+    ranges = _unpacked(raw.read(packed), length, most)
+    return ranges is not None and _digest(raw, length, ranges) == digest
+
+
+def _has_begun(raw: IO[bytes]) -> bool:
+    """Whether a seal begins where the HDF5 file ends, however little is left of it."""
+    raw.seek(0)
+    signature, version, end = START.unpack(raw.read(START.size))
+    if signature != SIGNATURE or version != 0 or end >= 1 << 63:
+        return False
+    raw.seek(end)
+    begun = raw.read(len(MAGIC))
+    return bool(begun) and MAGIC.startswith(begun)
+
+
+def _unpacked(packed: bytes, length: int, most: int) -> np.ndarray | None:
+    """The ranges in a seal of a file of `length` bytes, unpacked to `most` bytes; None if they cannot be of such a
+    file."""
+    try:
+        unpacker = zlib.decompressobj()
+        values = np.frombuffer(unpacker.decompress(packed, most), dtype="<i8").reshape(-1, 2)
+    except (zlib.error, ValueError):
+        return None
+    if not unpacker.eof:
+        return None
+    starts, sizes = values[:, 0], values[:, 1]
+    sound = (sizes > 0).all() and (starts >= 0).all() and (sizes <= length - np.minimum(starts, length)).all()
+    return values if sound and (starts[1:] >= starts[:-1] + sizes[:-1]).all() else None
+
+
+def _digest(raw: IO[bytes], length: int, ranges: np.ndarray) -> bytes:
+    """The SHA-256 of the ranges and of the first `length` bytes without them."""
+    found, at = hashlib.sha256(ranges.tobytes()), 0
+    for offset, size in [*ranges.tolist(), (length, 0)]:
+        raw.seek(at)
+        while at < offset and (block := raw.read(min(BLOCK, offset - at))):
+            found.update(block)
+            at += len(block)
+        at = offset + size
+    return found.digest()

@@ -10,7 +10,7 @@ from ..checks import InputError
 from ..io.objects import read_object
 from ..representations import Stored
 from ..workflows.run_folder import RunFolder, fitted_by, read_status
-from .parts import Frame, Shown, at_times, cut, shown
+from .parts import Frame, Shown, at_times, cut, shown, steps_of
 from .server import LiveView
 
 CUTS = 50
@@ -124,9 +124,3 @@ class Follow:
         except FileNotFoundError:
             return None
         return found.st_mtime_ns, found.st_size
-
-
-def steps_of(folder: RunFolder) -> list[str]:
-    """How far the last fit of a run has come, in words; nothing where metrics.csv does not say."""
-    losses = folder.history().get("loss")
-    return [] if losses is None or len(losses) == 0 else [f"step {len(losses)}, loss {losses[-1]:.4g}"]
