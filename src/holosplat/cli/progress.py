@@ -102,8 +102,7 @@ class ProgressBar:
         """A bar on a terminal, and lines in the log, if there is one; elsewhere lines on standard error."""
         self._stage, log = stage, sys.stderr.log if isinstance(sys.stderr, Copied) else None
         if not sys.stderr.isatty():
-            say = partial(print, file=sys.stderr, flush=True)
-            self._lines = _Lines(stage, fraction, self._clock, say)
+            self._lines = _Lines(stage, fraction, self._clock, lambda line: print(line, file=sys.stderr, flush=True))
             return
         from tqdm import tqdm
 

@@ -63,13 +63,13 @@ class Command:
         inputs, home = [], Path.home()
         for _, group in groupby(self.inputs, key=lambda one: one[0]):
             paths = [path for _, path in group if Path(os.path.realpath(path)) not in (near, *near.parents)]
-            for few in [(path,) for path in paths] if len(paths) <= MOST_NAMED else [(*paths,)]:
-                if few not in self._hashed:  # as they were when the first file was written
-                    self._hashed[few] = ({"files": len(few)} if len(few) > 1 else {}) | fingerprint(*few)
+            for few in [[path] for path in paths] if len(paths) <= MOST_NAMED else [paths]:
+                if (key := tuple(few)) not in self._hashed:  # as they were when the first file was written
+                    self._hashed[key] = ({"files": len(few)} if len(few) > 1 else {}) | fingerprint(*few)
                 place = Path(os.path.abspath(self.folder / few[0]))
                 names_home = home in place.parents and home not in (near, *near.parents)  # as the way from `near` would
                 relative = {} if names_home else {"relative": os.path.relpath(place, near)}
-                inputs.append({"path": home_safe(str(few[0])), **relative, **self._hashed[few]})
+                inputs.append({"path": home_safe(str(few[0])), **relative, **self._hashed[key]})
         words = " ".join(map(_quoted, ["holosplat", *self.words]))
         said = {"command": words, "folder": home_safe(str(self.folder)), "inputs": inputs}
         return {**_program(), **said, **({"decided": self.decided} if self.decided else {})}

@@ -292,7 +292,7 @@ def _magnification(entry: Entry, quantity: str, effective: tuple[str, ...]) -> n
 def _read_provenance(entry: h5py.Group) -> dict[str, str]:
     group = entry.get(PROVENANCE)
     return {
-        unquote(name): item.asstr(errors="replace")[()]
+        unquote(name): str(item.asstr(errors="replace")[()])
         for name, item in (group.items() if isinstance(group, h5py.Group) else ())
         if isinstance(item, h5py.Dataset) and h5py.check_string_dtype(item.dtype) and item.shape == ()
     }
