@@ -64,7 +64,7 @@ UNEXPLAINED = 3
 
 @dataclass(frozen=True)
 class Asked:
-    """What is asked of a reconstruction: of matter, method, light, geometry and motion."""
+    """What is asked of a reconstruction: what is known of the matter, method, light, geometry and motion."""
 
     matter: PriorOptions = field(default_factory=PriorOptions)
     how: MethodOptions = field(default_factory=MethodOptions)

@@ -92,8 +92,8 @@ UNSAID = ("None", "False", "True", "")
 
 @dataclass(frozen=True)
 class Option:
-    """An option: name (`pixel_size`), call, text, default as the parser shows it (or empty), heading, the parser's
-    action."""
+    """An option of a command: its name, such as `pixel_size`, how it is called, what it is, its default as the parser
+    shows it (empty: none), the heading above it, whether it is required, and the parser's action."""
 
     name: str
     called: str

@@ -193,7 +193,8 @@ def read_angles(path: Path) -> np.ndarray:
 
 
 def degrees(label: str, values: np.ndarray, where: str) -> np.ndarray:
-    """The angles [N] without a unit, if they can be degrees; `InputError` that says `where` to write the unit."""
+    """The angles [N] without a unit, as degrees; `InputError` that says `where` to write the unit, for those that cover
+    a half or a whole turn of radians."""
     if values.size >= FEW // 2:
         reach = np.ptp(values) * np.array([[1.0], [values.size / (values.size - 1)]])
         require(

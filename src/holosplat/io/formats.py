@@ -137,7 +137,8 @@ def read_as(path: str | Path, reading: Reading, joined: bool = True) -> Scan:
 
 
 def read_frames(path: str | Path, reading: Reading, joined: bool = True) -> Scan:
-    """The scan of `read_as`, of which pixels that are not above 0 are missing, and their number is said."""
+    """The scan of `read_as`, for those who take the logarithm of its frames: pixels that are not above 0 are missing,
+    and their number is said."""
     return _read(path, reading, True, joined)
 
 

@@ -274,7 +274,8 @@ def _required(path: Path, label: str, names: list[str], prefix: str) -> list[Pat
 
 
 def _places(path: Path, name: str, prefix: str) -> Iterator[Path]:
-    """Where HDF5 looks for the file `name` of `path` (`H5F_prefix_open_file`)."""
+    """Where HDF5 looks for the file `name` of `path`: as it is named, in folders of the environment, beside `path`, and
+    beside what `path` is a link to (`H5F_prefix_open_file`)."""
     given, short = Path(name), Path(Path(name).name)
     below = short if given.is_absolute() else given
     folders = [Path(part) for part in os.environ.get(prefix, "").split(os.pathsep) if part]

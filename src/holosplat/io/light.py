@@ -26,8 +26,11 @@ def write_light(
     still: np.ndarray | None = None,
     marks: Mapping[str, str] = MappingProxyType({}),
 ) -> None:
-    """Write coefficients [V, (K + 1)²] of `smooth_modes`, the light [H, W] of all frames, and `marks`; None: there is
-    none."""
+    """Write the light of frames: coefficients [V, (K + 1)²] of exp(Σ c m), m the products of cosines of 0 to K half
+    waves (`smooth_modes`), and the light [H, W] that all frames have in common; None: there is none.
+
+    marks: more attributes.
+    """
     from ..optics.background import ORDER  # needs torch, which takes longer than all else
 
     with new_hdf5(path) as file:

@@ -48,7 +48,8 @@ class Add(Protocol):
 
 
 def read_scan(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Scan:
-    """The projections of an NXtomo file, corrected when they are read; `given` and errors as of `open_scan`."""
+    """The projections of an NXtomo file, read when they are asked for, as (frame - mean dark) / (mean flat - mean dark)
+    if it has such frames; `given` and errors as of `open_scan`."""
     return LOADER.read(Path(path), given)
 
 

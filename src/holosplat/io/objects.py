@@ -292,7 +292,8 @@ MOST_OBJECTS = 100_000
 
 
 def write_series(path: Path, objects: Mapping[str, Stored], steps: Steps) -> None:
-    """Write 1 to `MOST_OBJECTS` objects by their names, in this order, into one compact file, as `steps` say."""
+    """Write 1 to `MOST_OBJECTS` objects by their names, in this order, into one compact file, as near as `steps` say;
+    `InputError` for none, or more."""
     require(0 < len(objects) <= MOST_OBJECTS, f"a series needs 1 to {MOST_OBJECTS} objects, but has {len(objects)}.")
     first, order, text = dict[str, Whole](), None, ""
     with new_hdf5(path) as file:

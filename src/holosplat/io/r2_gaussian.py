@@ -202,7 +202,8 @@ def _projections(entries: list[Table], shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _pitch(scanner: Table, shape: tuple[int, int]) -> float:
-    """The pixels' edge in the file's unit of length; `InputError` unless the detector covers the volume's cube."""
+    """The pixels' edge in the file's unit of length; `InputError` unless the detector covers the volume's cube without
+    an offset: the layout's two readers take other geometries differently."""
     edges = scanner.numbers("sDetector", (2,)) / shape
     cube = scanner.numbers("sVoxel", (3,)).max()
     even = bool(np.allclose(edges, edges[0], rtol=1e-3) and np.allclose(edges * shape, cube, rtol=1e-3))

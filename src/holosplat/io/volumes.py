@@ -231,8 +231,8 @@ OF, VIEWS, COPIES = "of", "views", "copies"
 
 
 def write_guess(path: Path, volume: Volume, spread: np.ndarray | None, of_copies: bool = False) -> None:
-    """Write guessed δ and β as `write_volume` does, and /spread [Z, Y, X], the deviation of occupancy (of copies or
-    views)."""
+    """Write guessed δ and β as `write_volume` does, and /spread [Z, Y, X], the standard deviation of occupancy, if
+    there is one; of_copies: in guesses of copies of the scene, else of its views."""
     with new_hdf5(path, 12 * volume.delta.size) as file:
         file.attrs.update({"voxel_size": np.array(volume.grid.voxel_size), "origin": np.array(volume.grid.origin)})
         for name in NAMES:

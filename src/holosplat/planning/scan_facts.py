@@ -271,8 +271,8 @@ def can_be_seen(scan: Scan) -> bool:
 
 
 def seen_of(scan: Scan, method: Method, whole: bool = False) -> Seen:
-    """Measure the training frames of `scan`, if they are few and of one time, as for white noise and even light; whole:
-    whether a run works on whole frames in any case."""
+    """Measure the training frames of `scan`, if they are few and of one time. Noise counts as white, and light as even:
+    in other light windows hold whole frames. whole: whether a run works on whole frames in any case (free poses)."""
     if not can_be_seen(scan) or scan.is_series:
         return UNSEEN
     scan = scan.train().in_memory()

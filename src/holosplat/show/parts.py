@@ -98,8 +98,8 @@ def shown(obj: Stored) -> Shown:
 
 
 def at_times(obj: Stored, times: Sequence[float]) -> dict[str, Stored]:
-    """Objects by labels of the time slider: a moving one at up to `TIMES` of `times` [s] or of its basis; else
-    itself."""
+    """The objects of the time slider by label: a moving one at up to `TIMES` of `times` [s], or from the first time of
+    its basis to the last if there are none; any other object alone."""
     if not isinstance(obj, InMotion):
         return {"": obj}
     basis = obj.basis
