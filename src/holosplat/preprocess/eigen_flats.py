@@ -164,8 +164,7 @@ class TotalVariationWeights:
             return np.zeros(0)
         from scipy.optimize import minimize  # which takes long to load
 
-        scaled = frame * (self.mean.sum() / frame.sum())  # least squares of the frame, as if it held no object
-        start = np.clip(self._inverse @ (scaled - self.mean).reshape(-1), -REACH, REACH)
+        start = np.clip(self._projected(frame), -REACH, REACH)
         edge = float(np.median(_slopes(self._logarithm(frame, start)[0])[2])) + 1e-12
         bounds = [(-REACH, REACH)] * len(start)
         found = minimize(
@@ -177,6 +176,11 @@ class TotalVariationWeights:
             options={"maxiter": ITERATIONS},
         )
         return found.x * self.deviations
+
+    def _projected(self, frame: np.ndarray) -> np.ndarray:
+        """Least-squares weights of the frame itself, as if it held no object: where the search begins."""
+        scaled = frame * (self.mean.sum() / frame.sum())
+        return self._inverse @ (scaled - self.mean).reshape(-1)
 
     def _logarithm(self, frame: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The logarithm [h, w] of the corrected frame, and its derivative by the flat field's logarithm's argument."""
