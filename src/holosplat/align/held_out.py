@@ -50,7 +50,9 @@ def place_frames(
     done, rounds = 0, sum(level.rounds for level in levels)
     for level in levels:
         binned = scan.binned(level.pixels)
-        occupied, grid = _occupancy(found, binned, material)
+        with torch.no_grad():
+            delta = found.voxelise(Grid.of_views(binned.views)).delta
+        occupied, grid = torch.from_numpy(delta / material.delta).float(), Grid.of_views(in_pixels(binned.views))
         frames, oversample = binned.measured, fringe_sampling(binned.exposures)
         for _ in range(level.rounds):
             search.move(occupied, grid, search.exposures(binned.exposures), frames, oversample)
@@ -80,13 +82,6 @@ def place_frames(
         np.minimum(before, after),
         tuple(words),
     )
-
-
-def _occupancy(found: Stored, scan: Scan, material: DeltaBeta) -> tuple[Tensor, Grid]:
-    """δ over that of `material` on the field of view of `scan`, and its grid with lengths in pixels."""
-    with torch.no_grad():
-        delta = found.voxelise(Grid.of_views(scan.views)).delta
-    return torch.from_numpy(delta / material.delta).float(), Grid.of_views(in_pixels(scan.views))
 
 
 def _by_mass(found: Stored, scan: Scan, material: DeltaBeta, options: PoseOptions) -> Tensor:

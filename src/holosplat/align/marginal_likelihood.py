@@ -67,7 +67,9 @@ class Following:
         self._waves = (-of_waves * blurring * views.pitch / radian(exposures, delta)).float()
         self._field = _white(_gaussian(grid.shape, leeway.width), grid.shape)
         near = _filtered(volume, _gaussian(grid.shape, 1.0)).clamp(0, 1)
-        self._deviations = leeway.edges * _slope(near) + leeway.insides * near
+        self._deviations = (
+            leeway.edges * torch.stack(torch.gradient(near)).square().sum(0).sqrt() + leeway.insides * near
+        )
 
     def frames(self, lines: Tensor) -> Tensor:
         """Changes of frames [..., V, H, W] by those of line integrals [pixels]; symmetric."""
@@ -148,11 +150,6 @@ def _white(transform: Tensor, shape: tuple[int, ...]) -> Tensor:
 
 def _filtered(field: Tensor, transform: Tensor) -> Tensor:
     return torch.fft.irfftn(torch.fft.rfftn(field) * transform, s=field.shape)
-
-
-def _slope(field: Tensor) -> Tensor:
-    """Its length, by central differences."""
-    return torch.stack(torch.gradient(field)).square().sum(0).sqrt()
 
 
 NAME, NONE = "errors of the plan", "none"

@@ -110,7 +110,11 @@ def record(
     require_apart(truth or out, source)
     _require_corrected(source)
     scan = part.of(read(source))
-    _require_noise_free(source, scan)
+    photons = scan.provenance.get("photons_per_pixel", "none")
+    require(
+        photons == "none",
+        f"{source} must be noise-free, but it has the noise of {photons} photons; simulate it without.",
+    )
     bench = _Bench.drawn(scan, options, camera, light)
     upright = RawLayout(_kinds(options, len(scan)), _mask(bench.sensor))
     layout = replace(upright, mask=_flipped(upright.mask, options.flip), flips=FLIPS[options.flip])
@@ -141,15 +145,6 @@ def _require_corrected(source: Path) -> None:
     with open_scan(source) as file:
         only = bool((file.kinds == PROJECTION).all())
     require(only, f"{source} must hold projections only, but it has flats, darks or invalid frames: it is raw already.")
-
-
-def _require_noise_free(source: Path, scan: Scan) -> None:
-    """`InputError` for frames with photon noise."""
-    photons = scan.provenance.get("photons_per_pixel", "none")
-    require(
-        photons == "none",
-        f"{source} must be noise-free, but it has the noise of {photons} photons; simulate it without.",
-    )
 
 
 def _photons(bench: _Bench, scan: Scan, options: RecordingOptions, number: int) -> np.ndarray:

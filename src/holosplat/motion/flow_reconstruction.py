@@ -274,7 +274,7 @@ class FlowSearch:
         windows = self.windows()
         for n, window in enumerate(windows):
             self.task.on_progress("flow", n / (len(windows) + 3))
-            state = self._step("flow", lambda s=state, w=window: self.turns(self._whole(s, w), s))
+            state = self._step("flow", lambda s=state, w=window: self.turns(self.problem(w, self.factor, s), s))
         return self.finished(self.freer(state))
 
     def _step(self, name: str, make: Callable[[], _State]) -> _State:
@@ -285,10 +285,6 @@ class FlowSearch:
 
     def _initial_state(self) -> _State:
         return self._still(self.on(self.first(), self.factor))
-
-    def _whole(self, state: _State, window: Sequence[int] | range) -> FlowProblem:
-        """The frames of the times numbered `window`, with the matter of `state`."""
-        return self.problem(window, self.factor, state)
 
     def first(self) -> VoxelGrid:
         """The volume of the middle time; of all times, as if nothing moved, where noise hides a single one."""

@@ -58,7 +58,10 @@ def scene_figure(reconstruction: Volume, truth: Volume | None, material: float) 
         shown = [(*found, camera(), "Reconstruction"), (*found, turned, "Turned by 90°")]
         panels = PanelGrid(1, [1.0, 1.0], [1.12, 1.12], (), 0.8 * WIDTH)
     else:
-        paint = _deviation(truth, 0.5 * material)
+        colours = matplotlib.colormaps[SIGNED_MAP]
+        paint = Deviation(
+            truth.delta, (0.5 * material), max(truth.grid.voxel_size), lambda d: colours(0.5 + 0.5 * d)[:, :3]
+        )
         shown = [
             (truth, to_rgb(TRUE_SURFACE), camera(), "Truth"),
             (*found, camera(), "Reconstruction"),
@@ -85,12 +88,6 @@ def _deviation_bar(figure: Figure, axes: Axes, limit: float) -> None:
     inset.xaxis.set_ticks_position("top")
     inset.set_xticklabels([f"−{end:.3g}", "0", f"{end:.3g} {unit}"])
     inset.tick_params(length=2, width=0.4, pad=1.5)
-
-
-def _deviation(truth: Volume, level: float) -> Deviation:
-    """Colours by distance from the true surface, blue inside and red outside of it, up to one voxel."""
-    colours = matplotlib.colormaps[SIGNED_MAP]
-    return Deviation(truth.delta, level, max(truth.grid.voxel_size), lambda d: colours(0.5 + 0.5 * d)[:, :3])
 
 
 def _surface_panel(axes: Axes, shown: SurfaceImage, grid: Grid) -> None:

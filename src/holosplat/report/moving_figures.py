@@ -212,8 +212,12 @@ def _picture(moving: Moving, k: int) -> np.ndarray:
     upright = high > wide  # panels side by side, or one over the other
     for i, (name, image, colours, limits) in enumerate(panels):
         place = (0.435 + 0.188 * i, 0.02, 0.183, 0.92) if upright else (0.44, 0.665 - 0.325 * i, 0.55, 0.265)
-        _frame(figure.add_axes(place), image, pixel, colours, limits, name)
-    return _pixels(figure)
+        axes = figure.add_axes(place)
+        image_panel(axes, image, (pixel, pixel), colours, limits)
+        axes.set_title(name, fontsize=7.5, pad=3)
+    canvas = figure.canvas
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
 def _turned(axes: Axes, moving: Moving, k: int) -> None:
@@ -232,18 +236,6 @@ def _turned(axes: Axes, moving: Moving, k: int) -> None:
     axes.set_axis_off()
     left, right = axes.get_xlim()
     scale_bar(axes, 1e-6 * (right - left), INK, 0.03)
-
-
-def _frame(axes: Axes, image: np.ndarray, pixel: float, colours: str, limits: tuple[float, float], title: str) -> None:
-    image_panel(axes, image, (pixel, pixel), colours, limits)
-    axes.set_title(title, fontsize=7.5, pad=3)
-
-
-def _pixels(figure: Figure) -> np.ndarray:
-    """What is drawn, [H, W, 3] uint8."""
-    canvas = figure.canvas
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()  # type: ignore[attr-defined]
 
 
 COLOURS = "A body has the same colour and number in all figures. "

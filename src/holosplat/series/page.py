@@ -76,7 +76,10 @@ def render_page(page: SeriesPage) -> str:
     kept, unread = _maps(shown)
     told = not any(frame.row.quantity == "β" for frame in shown)
     kept = kept if told else [(frame, -2 * phase) for frame, phase in kept]  # -k∫β, which stands for the phase then
-    low, high = _limits([phase for _, phase in kept])
+    values = [m[np.isfinite(m)] for m in ([phase for _, phase in kept])]
+    low = min((float(v.min()) for v in values if v.size), default=-1.0)
+    high = max((float(v.max()) for v in values if v.size), default=0.0)
+    low, high = (low, high) if high > low else (low - 1.0, low)
     ends = [f"{value + 0.0:.3g}{' rad' * told}".replace("-", "−") for value in (low, high)]  # −0 is 0
     pictures = [
         {
@@ -234,13 +237,6 @@ def _read(path: Path) -> np.ndarray:
     sound = found.ndim == 2 and found.dtype.kind == "f" and found.size > 0
     require(sound, f"{path} must be a phase map of numbers [H, W], but it is {found.dtype} of the shape {found.shape}.")
     return found.astype(np.float32)
-
-
-def _limits(maps: Sequence[np.ndarray]) -> tuple[float, float]:
-    values = [m[np.isfinite(m)] for m in maps]
-    low = min((float(v.min()) for v in values if v.size), default=-1.0)
-    high = max((float(v.max()) for v in values if v.size), default=0.0)
-    return (low, high) if high > low else (low - 1.0, low)
 
 
 def _png(phase: np.ndarray, low: float, high: float) -> str:

@@ -278,7 +278,7 @@ class _Bench:
         folder.write_picture(case.name, case.seed, TRUTH, picture)
         hashed, commit = scan_hash(scan), source_commit()
         blank = Row(case.name, case.seed, "", "", "", 0, "failed", "", hashed, commit, "")
-        blank = replace(blank, **environment(_backend()))
+        blank = replace(blank, **environment(resolve("auto")))
         return cls(case, scan, truth, picture, blank, on_progress)
 
     def attempt(self, job: _Job) -> tuple[Row, Arrays | None]:
@@ -318,11 +318,6 @@ class _Bench:
         if self.case.balls:
             picture["diameters"], picture["contrast"] = contrast_by_size(volume, self.truth, self.case.balls)
         return scores, picture
-
-
-def _backend() -> str:
-    """What fits compute on where the choice is theirs."""
-    return resolve("auto")
 
 
 def _jobs(suite: Suite, bench: _Bench, wanted: Sequence[str]) -> Iterator[_Job]:

@@ -97,7 +97,11 @@ def slices_figure(truth: Arrays, shown: Sequence[Shown]) -> Figure:
             drawn = image_panel(panel, picture.arrays[plane].astype(np.float32), pitch, DELTA_MAP, limits)
             if picture.arrays is truth and plane == "xz":
                 scale_bar(panel, sizes[plane][0], height=0.08, beside=True)
-    _bar_tile(tiles, len(shown) + 1, drawn, "δ, the material's = 1")
+    panels = tiles.tile((len(shown) + 1), "", "")
+    for panel in panels:
+        panel.set_axis_off()
+    if drawn is not None:
+        colour_bar(tiles.figure, drawn, tiles.beside(panels[0], 0.02, 0.07, 0.94), "δ, the material's = 1", "both")
     return tiles.figure
 
 
@@ -126,15 +130,6 @@ def holograms_figure(truth: Arrays, shown: Sequence[Shown]) -> Figure:
     if signed is not None:
         colour_bar(tiles.figure, signed, tiles.beside(below, 0.54, 0.07, 0.94), "difference", "both")
     return tiles.figure
-
-
-def _bar_tile(tiles: Tiles, index: int, drawn: AxesImage | None, label: str) -> None:
-    """A colour bar in place of a tile."""
-    panels = tiles.tile(index, "", "")
-    for panel in panels:
-        panel.set_axis_off()
-    if drawn is not None:
-        colour_bar(tiles.figure, drawn, tiles.beside(panels[0], 0.02, 0.07, 0.94), label, "both")
 
 
 def _size(image: np.ndarray, across: float, down: float) -> tuple[float, float]:
