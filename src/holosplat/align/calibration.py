@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from ..checks import InputError, at_least, in_range, require
 from ..geometry import Views
@@ -229,19 +228,15 @@ class _Search:
         if self.phantom.free:
             by = after.of_all[: len(places)].reshape(-1, 3).numpy() * exposures.views.pixel_size
             self.phantom = self.phantom.shifted(by)
-        self._note(frames, found.frames, after.covariances, scales, len(places))
+        deviations = after.covariances.diagonal().clamp_min(0).sqrt()
+        own = (deviations[len(deviations) - self.numbers.numel() :].reshape(self.numbers.shape) * scales).numpy()
+        self.errors = own[:, :FLUX] * np.array([1, 1, *[np.rad2deg(1)] * 3, 1, 1])
+        self.size_error = float(deviations[len(places)]) if self.options.pixel > 0 else 0.0
+        left = unexplained(frames, found.frames).square().mean((1, 2)).sqrt()
+        self.left = left.double().numpy()
         if pixel > 0:
             self.size = float(after.of_all[-1])
         self._centre()
-
-    def _note(self, frames: Tensor, seen: Tensor, covariances: Tensor, scales: Tensor, places: int) -> None:
-        """Errors of the numbers, and what is unexplained."""
-        deviations = covariances.diagonal().clamp_min(0).sqrt()
-        own = (deviations[len(deviations) - self.numbers.numel() :].reshape(self.numbers.shape) * scales).numpy()
-        self.errors = own[:, :FLUX] * np.array([1, 1, *[np.rad2deg(1)] * 3, 1, 1])
-        self.size_error = float(deviations[places]) if self.options.pixel > 0 else 0.0
-        left = unexplained(frames, seen).square().mean((1, 2)).sqrt()
-        self.left = left.double().numpy()
 
     def _centre(self) -> None:
         """The motion that all views share goes to the phantom: `x_lab = R x - s` stays what it is."""

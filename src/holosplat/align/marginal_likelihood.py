@@ -65,7 +65,10 @@ class Following:
         down, across = torch.fft.fftfreq(views.shape[0])[:, None], torch.fft.rfftfreq(views.shape[1])
         blurring = torch.exp(-2 * math.pi**2 * blur**2 * (down**2 + across**2))
         self._waves = (-of_waves * blurring * views.pitch / radian(exposures, delta)).float()
-        self._field = _white(_gaussian(grid.shape, leeway.width), grid.shape)
+        transform = _gaussian(grid.shape, leeway.width)
+        point = torch.zeros(grid.shape)
+        point[0, 0, 0] = 1
+        self._field = transform / _filtered(point, transform).norm()  # keeps the variance of white noise
         near = _filtered(volume, _gaussian(grid.shape, 1.0)).clamp(0, 1)
         self._deviations = (
             leeway.edges * torch.stack(torch.gradient(near)).square().sum(0).sqrt() + leeway.insides * near
@@ -113,16 +116,6 @@ def of_poses(
     powers = [columns.flatten(0, 1)]
     for _ in range(DEPTH):
         powers.append(torch.stack([root * follows.spread(root * image) for image in _unit(powers[-1])]))
-    return _quadratic(powers)
-
-
-def _unit(images: Tensor) -> Tensor:
-    """Each image over its length."""
-    return images / images.flatten(1).norm(dim=1).clamp_min(1e-30)[:, None, None, None]
-
-
-def _quadratic(powers: list[Tensor]) -> Tensor:
-    """`Cᵀ (1 + K)⁻¹ C` on the span of all but the last of `powers`: C, and K times the one before, made unit."""
     units = torch.cat([_unit(part) for part in powers[:-1]]).flatten(1).double()
     spread = torch.cat(powers[1:]).flatten(1).double()
     inner, moved = units @ units.T, units @ spread.T
@@ -134,18 +127,16 @@ def _quadratic(powers: list[Tensor]) -> Tensor:
     return across @ torch.linalg.solve(middle, across.T)
 
 
+def _unit(images: Tensor) -> Tensor:
+    """Each image over its length."""
+    return images / images.flatten(1).norm(dim=1).clamp_min(1e-30)[:, None, None, None]
+
+
 def _gaussian(shape: tuple[int, ...], sigma: float) -> Tensor:
     """The transform of a Gaussian on a periodic raster."""
     z, y, x = torch.fft.fftfreq(shape[0]), torch.fft.fftfreq(shape[1]), torch.fft.rfftfreq(shape[2])
     squares = z[:, None, None] ** 2 + y[:, None] ** 2 + x**2
     return torch.exp(-2 * math.pi**2 * sigma**2 * squares)
-
-
-def _white(transform: Tensor, shape: tuple[int, ...]) -> Tensor:
-    """So scaled that white noise of variance 1 keeps its variance."""
-    point = torch.zeros(shape)
-    point[0, 0, 0] = 1
-    return transform / _filtered(point, transform).norm()
 
 
 def _filtered(field: Tensor, transform: Tensor) -> Tensor:

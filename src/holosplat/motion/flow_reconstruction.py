@@ -154,7 +154,11 @@ class FlowSearch:
         self.run.state = self._state
         if saved := self.run.saved:
             with self.run.as_written():
-                self._take_up(saved)
+                self.history, self._strength = list(saved["history"]), float(saved["strength"])
+                self.decisions = [Decision.from_dict(one) for one in saved.get("decisions", ())]
+                self.prior = self.options.volume.prior.weakened(self._strength)
+                if "stage_steps" not in saved and (count := int(saved.get("steps", 0))):
+                    self.run.done = [*([None] * (count - 1)), saved]
 
     def by_itself(self, scan: Scan, name: str) -> VoxelGrid:
         """The volume of frames of one time; its prior is taken on."""
@@ -253,14 +257,6 @@ class FlowSearch:
             if len(near) == len(self.times):
                 return found
             reach *= 2
-
-    def _take_up(self, saved: Mapping[str, Any]) -> None:
-        """Go on where an earlier run ended; older versions kept the last step beside its number."""
-        self.history, self._strength = list(saved["history"]), float(saved["strength"])
-        self.decisions = [Decision.from_dict(one) for one in saved.get("decisions", ())]
-        self.prior = self.options.volume.prior.weakened(self._strength)
-        if "stage_steps" not in saved and (count := int(saved.get("steps", 0))):
-            self.run.done = [*([None] * (count - 1)), saved]
 
     def _state(self) -> dict[str, Any]:
         """What `_take_up` reads."""

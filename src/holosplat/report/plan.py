@@ -169,7 +169,11 @@ def _snr_axis(axes: Axes, survey: Survey) -> None:
 def _frame_panel(figure: Figure, axes: Axes, bar: Axes, survey: Survey) -> None:
     """The contrast of the pixels at the best point, the object on the corner of four."""
     setup, pixel = survey.setup, survey.setup.pixel_size
-    frame = _trimmed(survey.best_frame)
+    n = len(survey.best_frame)
+    rows, columns = np.nonzero(np.abs(survey.best_frame) > 0.05 * np.abs(survey.best_frame).max())
+    reach = int(np.ceil(np.abs(np.concatenate([rows, columns]) - 0.5 * (n - 1)).max()))
+    cut = max(0, n // 2 - reach - 2)
+    frame = survey.best_frame[cut : n - cut, cut : n - cut]
     scale, power = decimal_scale(float(np.abs(frame).max()))
     limit = float(np.abs(frame).max()) / scale
     drawn = image_panel(axes, frame / scale, (pixel, pixel), HOLOGRAM_MAP, (-limit, limit))
@@ -177,12 +181,3 @@ def _frame_panel(figure: Figure, axes: Axes, bar: Axes, survey: Survey) -> None:
     colour_bar(figure, drawn, bar, f"contrast ({power})" if power else "contrast")
     said = f"{setup.energy_kev:.3g} keV, {_distance(setup.distance)},\n{format_length(pixel)} pixels"
     axes.set_xlabel(said, labelpad=4)
-
-
-def _trimmed(frame: np.ndarray) -> np.ndarray:
-    """The middle [m, m] of `frame` [n, n], as far as its contrast is above 5 % of the greatest."""
-    n = len(frame)
-    rows, columns = np.nonzero(np.abs(frame) > 0.05 * np.abs(frame).max())
-    reach = int(np.ceil(np.abs(np.concatenate([rows, columns]) - 0.5 * (n - 1)).max()))
-    cut = max(0, n // 2 - reach - 2)
-    return frame[cut : n - cut, cut : n - cut]

@@ -157,7 +157,11 @@ def _first_hits(
     distance = np.asarray(distance_transform_edt(~matter))  # in voxels; a cell with matter lies within √3
     start = rotation.T[:, :2] @ np.stack([x, y]) + centre[:, None]
     along = rotation.T[:, 2]
-    enter, leave = _box_span(field, start, along)
+    low = (0.0 - field.offset) / field.per_metre
+    high = (np.asarray(field.values.shape[::-1]) - 1.0 - field.offset) / field.per_metre
+    slope = np.where(np.abs(along) < 1e-12, 1e-12, along)[:, None]
+    a, b = (low[:, None] - start) / slope, (high[:, None] - start) / slope
+    enter, leave = np.minimum(a, b).max(axis=0), np.maximum(a, b).min(axis=0)
     active = np.flatnonzero(enter < leave)
     depth = enter.copy()
     hits = []
@@ -184,15 +188,6 @@ def _bisect(field: _Field, start: np.ndarray, along: np.ndarray, depth: np.ndarr
         inside = field.at(field.values, start + along[:, None] * middle) > 1.0
         high, low = np.where(inside, middle, high), np.where(inside, low, middle)
     return high
-
-
-def _box_span(field: _Field, start: np.ndarray, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Depths [m] at which rays enter and leave the padded volume (slab method, Kay & Kajiya 1986)."""
-    low = (0.0 - field.offset) / field.per_metre
-    high = (np.asarray(field.values.shape[::-1]) - 1.0 - field.offset) / field.per_metre
-    slope = np.where(np.abs(along) < 1e-12, 1e-12, along)[:, None]
-    a, b = (low[:, None] - start) / slope, (high[:, None] - start) / slope
-    return np.minimum(a, b).max(axis=0), np.maximum(a, b).min(axis=0)
 
 
 def _shade(

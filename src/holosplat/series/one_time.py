@@ -17,7 +17,9 @@ from ..checks import InputError
 from ..geometry import Grid
 from ..inference import Compared, Decision, Score
 from ..io.atomic import atomic_path, read_json, write_json
+from ..io.formats import run_source
 from ..io.guard import read_array
+from ..io.reading import Reading
 from ..matter import MaterialPrior
 from ..methods import Method, Task
 from ..methods.continued import Continued
@@ -36,7 +38,7 @@ from ..workflows.reconstruction import Reconstruction
 from ..workflows.run_folder import RunFolder, claimed
 from .events import PARTS, Parts
 from .folder import Body, Row
-from .plan import Settings, prior_of
+from .plan import Settings, at, prior_of, times_of
 
 PHASE = "phase.npy"
 """The phase in the first view [rad], for pages."""
@@ -59,6 +61,13 @@ class Shot:
     prior: MaterialPrior
     source: dict[str, object]
     row: Row
+
+    @classmethod
+    def of(cls, scan: Scan, path: Path, prior: MaterialPrior, reading: Reading, row: Row) -> Shot:
+        """The time `row.frame` of the whole `scan` in the file `path`, read as `reading` says."""
+        frame = row.frame if len(times_of(scan)) > 1 else None
+        source = run_source(path, replace(reading, part=replace(reading.part, time_frame=frame)))
+        return cls(at(scan, row.frame), prior, source, row)
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import numpy as np
 from markupsafe import Markup
 from PIL import Image
@@ -98,7 +99,7 @@ def render_page(page: SeriesPage) -> str:
         pictures=pictures,
         told=told,
         ends=ends if abs(high) > abs(low) else ends[::-1],
-        colours=[f"rgb{anchor}" for anchor in ANCHORS],
+        colours=[f"rgb{tuple(colour)}" for colour in COLOURS[::51].tolist()],
         bar=next(filter(None, (_scale_bar(frame) for frame, _ in reversed(kept))), None),
         charts=_charts(page.frames),
         rows=[_cells(frame) for frame in page.frames[-MOST_ROWS:]],
@@ -243,30 +244,14 @@ def _png(phase: np.ndarray, low: float, high: float) -> str:
     """A phase map as a `data:` URI, black where it is zero and bright where it is largest."""
     bright = (phase - low) / (high - low) if abs(high) > abs(low) else (high - phase) / (high - low)
     image = Image.fromarray(np.rint(255 * np.clip(np.nan_to_num(bright), 0, 1)).astype(np.uint8))
-    image.putpalette(_palette())
+    image.putpalette(COLOURS.ravel().tolist())
     content = io.BytesIO()
     image.save(content, format="PNG", optimize=True)
     return f"data:image/png;base64,{base64.b64encode(content.getvalue()).decode()}"
 
 
-ANCHORS = (
-    (0, 0, 4),
-    (28, 16, 68),
-    (79, 18, 123),
-    (129, 37, 129),
-    (181, 54, 122),
-    (229, 80, 100),
-    (251, 135, 97),
-    (254, 194, 135),
-    (252, 253, 191),
-)
-"""Nine colours of matplotlib's map magma, evenly spaced; what lies between them is interpolated."""
-
-
-def _palette() -> list[int]:
-    at, given = np.linspace(0, 1, 256), np.linspace(0, 1, len(ANCHORS))
-    colours = [np.interp(at, given, [anchor[c] for anchor in ANCHORS]) for c in range(3)]
-    return np.rint(np.stack(colours, 1)).astype(int).ravel().tolist()
+COLOURS = np.rint(255 * matplotlib.colormaps["magma"](np.arange(256))[:, :3]).astype(int)
+"""[256, 3] red, green and blue of a picture, from the darkest to the brightest."""
 
 
 WIDTH, HEIGHT = 460, 190

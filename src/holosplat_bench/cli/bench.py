@@ -19,9 +19,7 @@ from holosplat.ranges import Seed
 
 if TYPE_CHECKING:
     from ..suite.folder import Row
-    from ..suite.methods import BenchMethod
     from ..suite.run import Suite
-    from ..thesis.folder import StudyFolder
 
 
 def thesis(

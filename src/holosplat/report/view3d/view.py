@@ -162,9 +162,21 @@ def part_of(obj: Stored, volume: Volume, pixel: float, times: np.ndarray | None 
     if isinstance(obj, GaussianCloud) and (found := _gaussians(obj, pixel)):
         return found
     if isinstance(obj, SurfaceMesh) and len(obj.faces) <= MOST_FACES:
-        return _surfaces(obj, pixel)
+        vertices = obj.vertices.detach().double().numpy() * (obj.unit_length / pixel)
+        bits, low, step = _in_bits(vertices, 16)
+        arrays = {"vertices": bits, "faces": _small(obj.faces.numpy())}
+        return ViewPart("surfaces", arrays, {"low": low, "step": step}, _channels(obj.matter))
     if isinstance(obj, MovingSurfaces) and times is not None and obj.coefficients[..., 0].numel() <= MOST_COEFFICIENTS:
-        return _paths(obj, pixel, times)
+        coefficients = obj.coefficients.detach().double().numpy() * (obj.unit_length / pixel)
+        bits, low, step = _in_bits(coefficients, 16)
+        shown = np.linspace(times[0], times[-1], min(MOST_TIMES, 4 * len(times) - 3))
+        arrays = {
+            "coefficients": bits,
+            "faces": _small(obj.faces.numpy()),
+            "weights": obj.basis.weights(shown).astype(np.float32),
+        }
+        facts = {"low": low, "step": step, "paths": len(bits), "times_us": [round(1e6 * t, 4) for t in shown]}
+        return ViewPart("paths", arrays, facts, _channels(obj.matter))
     return volume_part(volume, pixel, VOLUME_BYTES)
 
 
@@ -244,26 +256,6 @@ def _gaussians(cloud: GaussianCloud, pixel: float) -> ViewPart | None:
             "amplitudes": cloud.amplitudes.numpy()[kept].astype(np.float16),
         }
     return ViewPart("gaussians", arrays, {"low": low, "step": step, "count": len(kept)}, _channels(cloud.matter))
-
-
-def _surfaces(obj: SurfaceMesh, pixel: float) -> ViewPart:
-    vertices = obj.vertices.detach().double().numpy() * (obj.unit_length / pixel)
-    bits, low, step = _in_bits(vertices, 16)
-    arrays = {"vertices": bits, "faces": _small(obj.faces.numpy())}
-    return ViewPart("surfaces", arrays, {"low": low, "step": step}, _channels(obj.matter))
-
-
-def _paths(obj: MovingSurfaces, pixel: float, times: np.ndarray) -> ViewPart:
-    coefficients = obj.coefficients.detach().double().numpy() * (obj.unit_length / pixel)
-    bits, low, step = _in_bits(coefficients, 16)
-    shown = np.linspace(times[0], times[-1], min(MOST_TIMES, 4 * len(times) - 3))
-    arrays = {
-        "coefficients": bits,
-        "faces": _small(obj.faces.numpy()),
-        "weights": obj.basis.weights(shown).astype(np.float32),
-    }
-    facts = {"low": low, "step": step, "paths": len(bits), "times_us": [round(1e6 * t, 4) for t in shown]}
-    return ViewPart("paths", arrays, facts, _channels(obj.matter))
 
 
 def _channels(matter: Matter) -> tuple[tuple[float, float], ...]:
