@@ -151,10 +151,7 @@ class _Sharp:
         lines = self._lines(views)
         k, (delta, beta) = wavenumber(self.exposures.energy_kev), self.exposures.refraction(1.0, 1.0)
         k_delta, (h, w) = float((k * delta)[0]), (min(TILE, n) for n in views.shape)
-        wanted = _may_jump(k_delta * lines[1, 0])
-        size, last = torch.tensor([h, w]), torch.tensor(wanted.shape) - torch.tensor([h, w])
-        found = torch.minimum(torch.nonzero(wanted.cpu()) // size * size, last)
-        places = [(int(row), int(column)) for row, column in found.unique(dim=0)]
+        places = _tiles(_may_jump(k_delta * lines[1, 0]), h, w)
         for first in range(0, len(places), TOGETHER):
             some = places[first : first + TOGETHER]
             shifts = [views.cropped(slice(i, i + h), slice(j, j + w)).shifts for i, j in some]
@@ -187,6 +184,13 @@ def _may_jump(phase: torch.Tensor) -> torch.Tensor:
         across = second + third
         found |= ((across > 2 * STEEP) & (across > ALONE * (first + fourth))).movedim(1, axis)
     return found
+
+
+def _tiles(wanted: torch.Tensor, h: int, w: int) -> list[tuple[int, int]]:
+    """First rows and columns of the tiles of h × w samples that hold those that are `wanted` [H, W]."""
+    size, last = torch.tensor([h, w]), torch.tensor(wanted.shape) - torch.tensor([h, w])
+    found = torch.minimum(torch.nonzero(wanted.cpu()) // size * size, last)
+    return [(int(row), int(column)) for row, column in found.unique(dim=0)]
 
 
 def simulated_frames(obj: Object, exposures: Exposures, how: Simulation = Simulation()) -> Iterator[np.ndarray]:
