@@ -108,19 +108,10 @@ class Bump:
 
     power: int = 3
     """Exponent, 1 to 20."""
+    reach, core = 1.0, 0.0
 
     def __post_init__(self) -> None:
         require(1 <= self.power <= 20, f"power of a bump must lie between 1 and 20, but it is {self.power}.")
-
-    @property
-    def reach(self) -> float:
-        """1."""
-        return 1.0
-
-    @property
-    def core(self) -> float:
-        """None."""
-        return 0.0
 
     @property
     def mass(self) -> float:

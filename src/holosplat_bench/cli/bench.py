@@ -193,11 +193,17 @@ def arena(
     from holosplat.io.lock import sole_writer
 
     from ..suite.arena.cases import FAMILIES
-    from ..suite.arena.contest import CONTESTANTS
-    from ..suite.arena.run import Arena, ArenaFolder, chosen_tracks, entry_of, run_arena
+    from ..suite.arena.contest import CONTESTANTS, TRACKS
+    from ..suite.arena.run import Arena, ArenaFolder, entry_of, run_arena
     from ..suite.run import chosen
 
-    made = Arena(chosen("--cases", cases, list(FAMILIES)), chosen_tracks(tracks), draw.seed, draw.size, draw.limit)
+    made = Arena(
+        chosen("--cases", cases, list(FAMILIES)),
+        chosen("--tracks", tracks, list(TRACKS)),
+        draw.seed,
+        draw.size,
+        draw.limit,
+    )
     if list_only:
         print("cases:", *made.cases, sep="\n  ")
         for one in CONTESTANTS:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -47,6 +47,7 @@ from holosplat.workflows.reconstruct import reconstruct
 
 from ..opponents.mbir import MbirPerView
 from ..opponents.photographs import AlphaSplats, RadianceFields
+from .folder import REFERENCE
 from .prepare import MeasuredCase
 
 Aligner = Callable[[Scan, MaterialPrior, Progress], Scan]
@@ -304,6 +305,9 @@ def of_benchmark(cases: Sequence[Needs]) -> Needs:
 class Reference:
     """name: for the table; summary: one line of what it is; run: (case, true volume, on_progress) → Object,
     `InputError` with the reason where the case has no such reference."""
+
+    family: ClassVar[str] = REFERENCE
+    aligner: ClassVar[None] = None
 
     name: str
     summary: str

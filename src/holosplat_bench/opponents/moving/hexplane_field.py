@@ -24,7 +24,7 @@ from holosplat.representations import Stored, VoxelGrid
 from holosplat.tables import from_table, to_table
 
 from .each_time import EachTimeStage, require_times, usual_start
-from .moving_voxels import LowRankVoxels, OnVoxels, VoxelSeries, from_plain, shares
+from .moving_voxels import LowRankVoxels, OnVoxels, VoxelSeries, from_plain, require_shapes, shares
 from .times import Cost, TimesFit, times_fit
 
 PAIRS = (("xy", "zt"), ("xz", "yt"), ("yz", "xt"))
@@ -113,10 +113,7 @@ class HexPlaneField(OnVoxels):
     ) -> None:
         super().__init__(grid, times, matter, upper)
         wanted = options.shapes(grid, len(self.times))
-        for name in {**wanted, **weights}:
-            shape = tuple(weights[name].shape) if name in weights else None
-            right = wanted.get(name)
-            require(shape == right, f"{name} of a hexplane field must have the shape {right}, but it has {shape}.")
+        require_shapes("a hexplane field", weights, wanted)
         self.options, self._weights = options, {name: weights[name] for name in wanted}
         self._nodes = np.linspace(self.times[0], self.times[-1], options.time_nodes or len(self.times))
         self._axes = {axis: hats(n, options.nodes(n)) for axis, n in zip("zyx", grid.shape)}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from importlib import metadata
@@ -294,11 +294,3 @@ def gradient(question: Question) -> np.ndarray:
     side = volume.shape[0]
     spread = footprints(question.angles, side).T @ lines.transpose(0, 2, 1).reshape(views * columns, rows)
     return spread.reshape(side, columns, rows).transpose(0, 2, 1)
-
-
-def chosen_tracks(wanted: Sequence[str], table: Mapping[Track, str] = TRACKS) -> list[Track]:
-    """The wanted tracks in the table's order, all if none is wanted."""
-    from ..run import chosen
-
-    names = chosen("--tracks", wanted, list(table))
-    return [track for track in table if track in names]
