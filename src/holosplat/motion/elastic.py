@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -195,16 +196,6 @@ class SizeKept:
         return vertices.new_zeros(self._count).index_add(0, self._body, parts)
 
 
-def volume_kept(weight: float, start: MovingSurfaces, times: np.ndarray) -> SizeKept:
-    """The penalty on changes of the volume of each body."""
-    return SizeKept("volume_kept", _tetrahedra, weight, start, times)
-
-
-def area_kept(weight: float, start: MovingSurfaces, times: np.ndarray) -> SizeKept:
-    """The penalty on changes of the area of each body."""
-    return SizeKept("area_kept", _triangles, weight, start, times)
-
-
 def _tetrahedra(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
     """Signed volumes [F] between the origin and triangles of the corners a, b, c [F, 3]."""
     return (a * torch.linalg.cross(b, c)).sum(1) / 6
@@ -213,6 +204,12 @@ def _tetrahedra(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
 def _triangles(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
     """Areas [F] of triangles of the corners a, b, c [F, 3]."""
     return 0.5 * torch.linalg.cross(b - a, c - a).norm(dim=1)
+
+
+volume_kept = partial(SizeKept, "volume_kept", _tetrahedra)
+"""The penalty on changes of the volume of each body, of a weight, a start and times."""
+area_kept = partial(SizeKept, "area_kept", _triangles)
+"""The same of its area."""
 
 
 def square_root(gram: np.ndarray) -> np.ndarray:

@@ -69,13 +69,9 @@ class TotalMatter:
             quantity: Literal["δ", "β"] = "δ" if values["quantity"] == "delta" else "β"
             profile = ProfileErrors.from_dict(values["profile"]) if "profile" in values else None
             held = float(values["held_m3"])
-            return cls(quantity, _float(number), _float(error), held, str(values["words"]), profile)
-        except (KeyError, TypeError, ValueError) as error:
-            raise InputError(f"a total must be what reconstruct wrote, but it lacks or garbles {error}.") from error
-
-
-def _float(value: Any) -> float | None:
-    return None if value is None else float(value)
+            return cls(quantity, number, error, held, str(values["words"]), profile)
+        except (KeyError, TypeError, ValueError) as fault:
+            raise InputError(f"a total must be what reconstruct wrote, but it lacks or garbles {fault}.") from fault
 
 
 def total_of_run(said: Prediction, frames: Scan, task: Task, constants: tuple[Determined, ...] = ()) -> TotalMatter:
