@@ -357,7 +357,7 @@ class FlowSearch:
         left = [int(k) for k in np.flatnonzero((~keep).any(1))]
         if not left or how.most_final <= how.final:
             return how.final
-        large = self.problem(range(len(keep)), self.factor, state, keep)
+        large = self._problem_of_all(state, keep)
         state = self._finer(replace(state, u=descend(large, state.u, how.iterations)[0]))
         kept, aside = self.problem(range(len(keep)), 1, state, keep), self.problem(left, 1, state, ~keep)
         best, gain = iterations_that_predict(kept, aside, state.u, how.most_final)

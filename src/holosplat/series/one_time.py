@@ -14,6 +14,7 @@ import torch
 
 from ..bodies.rest_shape import moments
 from ..checks import InputError
+from ..frames import block_means
 from ..geometry import Grid
 from ..inference import Compared, Decision, Score
 from ..io.atomic import atomic_path, read_json, write_json
@@ -364,10 +365,7 @@ def write_phase(path: Path, found: Stored, scan: Scan) -> None:
     views = scan.views[[0]]
     with torch.no_grad():
         _, lines = found.project(views)
-        delta = lines[0].cpu().numpy()
-    factor = -(-max(views.shape) // MOST_PIXELS)
-    h, w = (n // factor * factor for n in views.shape)
-    binned = delta[:h, :w].reshape(h // factor, factor, w // factor, factor).mean((1, 3))
+    binned = block_means(lines[0].cpu().numpy(), -(-max(views.shape) // MOST_PIXELS))
     with atomic_path(path) as temporary:
         np.save(
             temporary, (-wavenumber(scan.exposures.reference_energy) * binned).astype(np.float16), allow_pickle=False

@@ -13,7 +13,7 @@ from typing import TypeVar
 import numpy as np
 
 from ..bodies.rest_shape import moments
-from ..checks import InputError, is_of_memory, require
+from ..checks import InputError, is_of_memory, reason_of, require
 from ..io.atomic import read_json, write_json
 from ..io.formats import read_frames, run_source
 from ..io.lock import sole_writer
@@ -200,14 +200,11 @@ def attempted(work: Callable[[], Result]) -> tuple[Result | None, str]:
     """What `work` gives, and "", or None and why it failed: one fault must not take the others' results."""
     try:
         return work(), ""
-    except InputError as error:
-        return None, str(error)
     except Exception as error:
-        if is_of_memory(error):
+        if is_of_memory(error) and not isinstance(error, InputError):
             reason = "the memory of this machine is not enough; take larger pixels (--bin), fewer rows or fewer jobs"
             return None, reason
-        lines = str(error).strip().splitlines()
-        return None, ": ".join([type(error).__name__, *lines[-1:]])
+        return None, reason_of(error)
 
 
 def opened(source: Source, reading: Reading) -> Scan:

@@ -107,10 +107,10 @@ def errors_of(found: Reconstruction, truth: Volume) -> dict[str, float]:
 
 def _centre(delta: np.ndarray) -> np.ndarray:
     """The centre of mass [voxels]; the middle of an empty volume."""
+    from scipy.ndimage import center_of_mass  # which takes long to load
+
     weight = np.abs(delta).astype(np.float64)
-    weight = weight if weight.any() else np.ones_like(weight)
-    axes = [weight.sum(axis=tuple(b for b in range(3) if b != a)) for a in range(3)]
-    return np.array([float(np.average(np.arange(len(w)), weights=w)) for w in axes])
+    return np.array(center_of_mass(weight if weight.any() else np.ones_like(weight)))
 
 
 @dataclass(frozen=True)

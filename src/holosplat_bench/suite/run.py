@@ -19,7 +19,7 @@ from holosplat.align.held_out import place_frames
 from holosplat.align.poses import PoseOptions
 from holosplat.backends import resolve
 from holosplat.beamline.declaration import Case
-from holosplat.checks import InputError, require
+from holosplat.checks import InputError, reason_of, require
 from holosplat.metrics import resolution
 from holosplat.optics.sampling import fringe_sampling
 from holosplat.progress import Progress
@@ -292,11 +292,8 @@ class _Bench:
             row = replace(row, status="done", stored_bytes=size, **_numbers(scores))
             if isinstance(self.case, MeasuredCase):
                 row.volume.update(agreement(found.voxelise(self.truth.grid), self.truth))
-        except InputError as error:
-            row = replace(row, reason=str(error))
         except Exception as error:  # one method's fault must not take the others' results
-            lines = str(error).strip().splitlines()
-            row = replace(row, reason=": ".join([type(error).__name__, *lines[-1:]]))
+            row = replace(row, reason=reason_of(error))
         return replace(row, when=datetime.now(UTC).isoformat(timespec="seconds")), picture
 
     def _produced(self, job: BenchMethod | Reference, on_progress: Progress) -> Object:

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 from holosplat.baselines import HolographicTV
-from holosplat.checks import at_least, positive, require
+from holosplat.checks import at_least, positive, require, require_shapes
 from holosplat.fit.loop import Fit
 from holosplat.geometry import Grid
 from holosplat.matter import Matter
@@ -24,7 +24,7 @@ from holosplat.representations import Stored, VoxelGrid
 from holosplat.tables import from_table, to_table
 
 from .each_time import EachTimeStage, require_times, usual_start
-from .moving_voxels import LowRankVoxels, OnVoxels, VoxelSeries, from_plain, require_shapes, shares
+from .moving_voxels import LowRankVoxels, OnVoxels, VoxelSeries, from_plain, shares
 from .times import Cost, TimesFit, times_fit
 
 PAIRS = (("xy", "zt"), ("xz", "yt"), ("yz", "xt"))
@@ -113,7 +113,7 @@ class HexPlaneField(OnVoxels):
     ) -> None:
         super().__init__(grid, times, matter, upper)
         wanted = options.shapes(grid, len(self.times))
-        require_shapes("a hexplane field", weights, wanted)
+        require_shapes("{} of a hexplane field", weights, wanted)
         self.options, self._weights = options, {name: weights[name] for name in wanted}
         self._nodes = np.linspace(self.times[0], self.times[-1], options.time_nodes or len(self.times))
         self._axes = {axis: hats(n, options.nodes(n)) for axis, n in zip("zyx", grid.shape)}

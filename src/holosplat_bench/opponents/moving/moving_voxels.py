@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from holosplat.backends import in_main_memory
-from holosplat.checks import require
+from holosplat.checks import require, require_shapes
 from holosplat.display import of_object
 from holosplat.geometry import Grid, Poses, Views
 from holosplat.matter import Matter
@@ -133,7 +133,7 @@ class VoxelSeries(OnVoxels):
         self, volumes: Tensor, grid: Grid, times: Sequence[float] | np.ndarray, matter: Matter, upper: float = 0.0
     ) -> None:
         super().__init__(grid, times, matter, upper)
-        require_shapes("a voxel series", {"volumes": volumes}, {"volumes": (len(self.times), *grid.shape)})
+        require_shapes("{} of a voxel series", {"volumes": volumes}, {"volumes": (len(self.times), *grid.shape)})
         self.volumes = volumes
 
     def values(self, time: float) -> Tensor:
@@ -178,7 +178,7 @@ class LowRankVoxels(OnVoxels):
         rank = volumes.shape[0] if volumes.ndim else 0
         require(rank >= 1, "voxels of low rank need one volume at least.")
         wanted = {"volumes": (rank, *grid.shape), "courses": (rank, len(self.times))}
-        require_shapes("voxels of low rank", {"volumes": volumes, "courses": courses}, wanted)
+        require_shapes("{} of voxels of low rank", {"volumes": volumes, "courses": courses}, wanted)
         self.volumes, self.courses = volumes, courses
 
     @classmethod
@@ -236,11 +236,3 @@ class _Held(torch.autograd.Function):
         (values,) = ctx.saved_tensors
         away = ((values < 0) & (upstream > 0)) | ((values > ctx.upper) & (upstream < 0))
         return upstream.masked_fill(away, 0.0), None
-
-
-def require_shapes(of: str, given: Mapping[str, Tensor], wanted: Mapping[str, tuple[int, ...]]) -> None:
-    """`InputError` unless the tensors `given` are those `wanted`, of these shapes; of: what they make."""
-    for name in {**wanted, **given}:
-        shape = tuple(given[name].shape) if name in given else None
-        right = wanted.get(name)
-        require(shape == right, f"{name} of {of} must have the shape {right}, but it has {shape}.")

@@ -204,9 +204,6 @@ class _Judge:
             return {"error": _relative(_shaped(answer["gradient"], wanted.shape), wanted)}
         if track == "retrieval":
             return {"error": _relative(_shaped(answer["lines"], self.case.lines.shape), self.case.lines)}
-        return self._of_volume(answer)
-
-    def _of_volume(self, answer: Answer) -> dict[str, float | None]:
         truth, scan, material = self.case.truth, self.case.scan, robust_material_delta(self.case.truth)
         delta = _shaped(answer["volume"], truth.grid.shape) / (self._k() * scan.views.pixel_size)
         beta = _shaped(answer["beta"], delta.shape) if "beta" in answer else delta / self.case.ratio

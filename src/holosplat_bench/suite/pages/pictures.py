@@ -15,6 +15,7 @@ from holosplat.report.style import (
     SIGNED_MAP,
     WIDTH,
     colour_bar,
+    grey_limits,
     image_panel,
     new_figure,
     scale_bar,
@@ -111,8 +112,7 @@ def holograms_figure(truth: Arrays, shown: Sequence[Shown]) -> Figure:
     height, width = measured.shape
     pitch = (float(truth["pixel_size"]), float(truth["pixel_size"]))
     tiles = Tiles(len(shown) + 1, [height / width] * 2)
-    low, high = (float(v) for v in np.percentile(measured, [0.2, 99.8]))
-    limits = (low, high) if high > low else (low - 0.5, low + 0.5)
+    limits = grey_limits(measured)
     residuals = [picture.arrays["frame"].astype(np.float32) - measured for picture in shown]
     extremes = [float(np.percentile(np.abs(residual), 99.5)) for residual in residuals]
     limit = float(np.median(extremes)) or 1.0 if extremes else 1.0
