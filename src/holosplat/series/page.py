@@ -11,7 +11,6 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 from markupsafe import Markup
 from PIL import Image
@@ -20,7 +19,7 @@ from ..checks import InputError, require, require_regular
 from ..io.atomic import atomic_path
 from ..io.guard import read_array
 from ..report.page import Headline, template
-from ..report.style import bar_length, format_length, in_print, scientific, superscript
+from ..report.style import bar_length, format_length, in_print, palette, scientific, superscript
 from ..units import in_percent, two_digits
 from ..units import plain as in_digits
 from ..workflows.next_step import next_step
@@ -99,7 +98,7 @@ def render_page(page: SeriesPage) -> str:
         pictures=pictures,
         told=told,
         ends=ends if abs(high) > abs(low) else ends[::-1],
-        colours=[f"rgb{tuple(colour)}" for colour in COLOURS[::51].tolist()],
+        colours=[f"rgb{tuple(colour)}" for colour in palette()[::51].tolist()],
         bar=next(filter(None, (_scale_bar(frame) for frame, _ in reversed(kept))), None),
         charts=_charts(page.frames),
         rows=[_cells(frame) for frame in page.frames[-MOST_ROWS:]],
@@ -244,14 +243,10 @@ def _png(phase: np.ndarray, low: float, high: float) -> str:
     """A phase map as a `data:` URI, black where it is zero and bright where it is largest."""
     bright = (phase - low) / (high - low) if abs(high) > abs(low) else (high - phase) / (high - low)
     image = Image.fromarray(np.rint(255 * np.clip(np.nan_to_num(bright), 0, 1)).astype(np.uint8))
-    image.putpalette(COLOURS.ravel().tolist())
+    image.putpalette(palette().ravel().tolist())
     content = io.BytesIO()
     image.save(content, format="PNG", optimize=True)
     return f"data:image/png;base64,{base64.b64encode(content.getvalue()).decode()}"
-
-
-COLOURS = np.rint(255 * matplotlib.colormaps["magma"](np.arange(256))[:, :3]).astype(int)
-"""[256, 3] red, green and blue of a picture, from the darkest to the brightest."""
 
 
 WIDTH, HEIGHT = 460, 190

@@ -17,7 +17,6 @@ from functools import cache
 from importlib.resources import files
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 import torch
 from markupsafe import Markup
@@ -28,6 +27,7 @@ from ...representations import GaussianCloud, MovingSurfaces, Stored, SurfaceMes
 from ...scan import Exposures
 from ...units import wavenumber
 from ...volume import Volume
+from ..style import palette
 
 MOST_COLUMNS = 320
 """Raster pixels along the longer edge of the view's frame."""
@@ -110,14 +110,8 @@ def packed(view: View3D) -> tuple[dict[str, Any], bytes]:
         "grey": list(view.grey),
         "phase": view.ends,
         "delta_told": view.delta_told,
-        "colours": _colours(),
+        "colours": palette().ravel().tolist(),
     }, bytes(blob)
-
-
-@cache
-def _colours() -> list[int]:
-    """256 colours from dark to light, as red, green and blue in turn."""
-    return np.rint(255 * mpl.colormaps["magma"](np.linspace(0, 1, 256))[:, :3]).astype(int).ravel().tolist()
 
 
 @cache
