@@ -212,7 +212,7 @@ def _picture(moving: Moving, k: int) -> np.ndarray:
         axes.set_title(name, fontsize=7.5, pad=3)
     canvas = figure.canvas
     canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()  # type: ignore[attr-defined]
 
 
 def _turned(axes: Axes, moving: Moving, k: int) -> None:

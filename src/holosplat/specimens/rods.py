@@ -118,7 +118,7 @@ class RodScene(Unmoved):
     def voxelise(self, grid: Grid) -> Volume:
         """δ and β against the medium, averaged over voxels, from `PER_VOXEL`³ points of each."""
         share, (nz, ny, nx) = np.zeros(grid.shape), grid.shape
-        x, y, z = grid.divided((PER_VOXEL,) * 3).axes()
+        x, y, z = grid.divided((PER_VOXEL, PER_VOXEL, PER_VOXEL)).axes()
         cells = (1, PER_VOXEL, ny, PER_VOXEL, nx, PER_VOXEL)
         for k in range(nz):
             layer = z[k * PER_VOXEL : (k + 1) * PER_VOXEL]

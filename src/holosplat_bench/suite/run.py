@@ -221,7 +221,7 @@ def run_suite(
     }
     left = sum(len(names) for names in missing.values())
     tables = (suite.references, suite.methods)
-    jobs = [(place, *named) for table in tables for place, named in enumerate(table.items())]
+    jobs = [(place, method, job) for table in tables for place, (method, job) in enumerate(table.items())]
     for (name, seed), wanted in missing.items():
         if not wanted:
             continue
