@@ -17,6 +17,7 @@ with rays through meshes, or closed forms, on a raster several times finer than 
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -39,11 +40,10 @@ from holosplat.metrics import dice, robust_material_delta
 from holosplat.scan import Scan
 from holosplat.workflows.certainty import (
     FACTORS,
+    LEVEL,
     SIGNED,
     SIZES,
-    conformal_quantile,
     errors_of,
-    fitted_factor,
     scale_of,
 )
 from holosplat.workflows.rehearsal import RESIDUAL, Rehearsal, rehearse
@@ -174,6 +174,28 @@ def reliability() -> None:
 def columns_of(rows: Sequence[dict[str, Any]], name: str) -> np.ndarray:
     """Errors and scales of a quantity, [2, N]."""
     return np.array([[float(row[f"{name}_{what}"]) for row in rows] for what in ("error", "scale")])
+
+
+def conformal_quantile(scores: np.ndarray, level: float) -> float:
+    """The ⌈(n + 1) level⌉-th smallest of n scores, which the next one exceeds with a probability of at most 1 - level
+    (Vovk et al. 2005; Lei et al. 2018, section 2.2); infinite for too few."""
+    rank = math.ceil((len(scores) + 1) * level)
+    return float(np.sort(scores)[rank - 1]) if rank <= len(scores) else math.inf
+
+
+def fitted_factor(errors: np.ndarray, scales: np.ndarray) -> tuple[float, float]:
+    """The floor and the factor of a quantity by its errors [N] and its scales [N] in N scenes.
+
+    Each floor, of the scales that there are, makes intervals that cover `LEVEL` of the scenes: that of the least mean
+    logarithm of the length is taken (efficiency; Vovk et al. 2016, COPA). Of so few scenes that there is no quantile,
+    the factor is the largest score; then the level is n/(n + 1).
+    """
+    sizes, found = np.abs(errors), list[tuple[float, float, float]]()
+    for floor in np.unique(scales[scales > 0]):
+        scores = sizes / (scales + floor)
+        factor = min(conformal_quantile(scores, LEVEL), float(scores.max()))
+        found.append((float(np.log(factor * (scales + floor)).mean()), float(floor), factor))
+    return min(found)[1:]
 
 
 def summary() -> None:

@@ -25,8 +25,7 @@ from rows import merge
 
 import holosplat as hs
 from holosplat.geometry import Grid
-from holosplat.io.compact import steps_of
-from holosplat.io.objects import read_object, write_compact
+from holosplat.io.objects import read_object, steps_of, write_compact
 from holosplat.io.ome import CHUNK
 from holosplat.matter import Matter
 from holosplat.representations import Stored, VoxelGrid

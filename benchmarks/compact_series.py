@@ -19,8 +19,7 @@ from machine import commit
 from rows import merge
 
 import holosplat as hs
-from holosplat.io.compact import Steps
-from holosplat.io.objects import names_of, read_object, read_series, write_compact, write_object, write_series
+from holosplat.io.objects import Steps, names_of, read_object, read_series, write_compact, write_object, write_series
 from holosplat.representations import MovingGaussians, MovingSurfaces, Stored
 from holosplat.workflows.reconstruction import instants_of
 

@@ -34,7 +34,7 @@ from holosplat.methods import METHODS
 from holosplat.methods.surface_fit import oversampling
 from holosplat.workflows.evaluate import Scores, score_object
 from holosplat.workflows.provenance import environment
-from holosplat_bench.suite.declared import Between
+from holosplat_bench.suite.case import Between
 
 HAEMOGLOBIN = hs.materials.HAEMOGLOBIN.delta_beta(20.0)
 

@@ -181,6 +181,15 @@ def unjudged_runs() -> Iterator[None]:
         yield
 
 
+@pytest.fixture
+def quick_likelihood() -> Iterator[None]:
+    """The likelihood of δ/β is that of volumes of few steps; see `helpers.short`."""
+    from helpers.short import in_few_steps
+
+    with in_few_steps():
+        yield
+
+
 @pytest.fixture(scope="session")
 def memory() -> Once:
     """What short runs of this session begin with, by their frames; see `helpers.once`."""

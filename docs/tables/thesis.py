@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from holosplat.report.style import scientific
-from holosplat_bench.suite.case import FOLDER
-from holosplat_bench.suite.declared import read_declaration
+from holosplat_bench.suite.case import FOLDER, read_declaration
 from holosplat_bench.thesis.configurations import EVERY, PACES, THESIS_TABLE
 from holosplat_bench.thesis.findings import findings
 from holosplat_bench.thesis.folder import CURVES, Study

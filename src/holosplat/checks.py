@@ -67,6 +67,13 @@ def is_of_memory(error: BaseException) -> bool:
     return isinstance(error, MemoryError) or bool(OUT_OF_MEMORY.search(str(error)))
 
 
+def reason_of(error: Exception) -> str:
+    """Why something failed, in a line: an `InputError` says it; of others the kind and the last line."""
+    if isinstance(error, InputError):
+        return str(error)
+    return ": ".join([type(error).__name__, *str(error).strip().splitlines()[-1:]])
+
+
 def note(text: str) -> None:
     """Say what was found in the input: on standard error of a command, in Python by the logger `holosplat`."""
     logging.getLogger("holosplat").info(text)
@@ -141,9 +148,12 @@ def shaped(field: str, array: np.ndarray, shape: tuple[int | None, ...]) -> np.n
 
 
 def require_shapes(label: str, given: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
-    """`InputError` unless `given` holds the arrays that are `wanted`, of the same shapes; label: {} is one's name."""
+    """`InputError` unless `given` holds the arrays that are `wanted`, of the same shapes; wanted: arrays, or shapes;
+    label: {} is one's name."""
     for name in {**wanted, **given}:
-        want, got = (tuple(table[name].shape) if name in table else None for table in (wanted, given))
+        want, got = (
+            tuple(getattr(table[name], "shape", table[name])) if name in table else None for table in (wanted, given)
+        )
         require(want == got, f"{label.format(name)} must have the shape {want}, but it has {got}.")
 
 

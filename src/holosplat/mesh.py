@@ -114,6 +114,11 @@ def winding_number(triangles: np.ndarray, point: np.ndarray) -> float:
     return float(abs(2 * np.arctan2(numerator, denominator).sum()) / (4 * np.pi))
 
 
+def ball_radius(volume: float) -> float:
+    """Radius [m] of the ball of a `volume` [m³]."""
+    return float((3 * volume / (4 * np.pi)) ** (1 / 3))
+
+
 def vector_areas(mesh: TriangleMesh) -> np.ndarray:
     """[F, 3] m²: normals of the triangles, of the length of the triangle's area."""
     a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)

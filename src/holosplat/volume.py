@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, Self, runtime_checkable
 
 import numpy as np
 
@@ -99,6 +99,14 @@ class Object(Protocol):
         ...
 
 
+class Unmoved:
+    """What objects have in common that do not move."""
+
+    def at(self, time: float) -> Self:
+        """The object itself."""
+        return self
+
+
 @runtime_checkable
 class Component(Protocol):
     """A part of a model whose numbers can be fitted: they have names, and other ones can take their place."""
@@ -153,7 +161,7 @@ Section = tuple[float, float]
 
 
 @dataclass(frozen=True)
-class Wall:
+class Wall(Unmoved):
     """A tube along y, or a channel in a slab that is larger than the field, of known place and matter; an `Object`.
 
     It has no ends. δ and β are differences from what lies outside of the wall.
@@ -194,10 +202,6 @@ class Wall:
         """Sections, and the (δ, β) that each adds to what is around it."""
         filled = [(self.inner, np.subtract(self.filling, self.matter))]
         return filled if self.outer is None else [(self.outer, np.array(self.matter, dtype=float)), *filled]
-
-    def at(self, time: float) -> Wall:
-        """Itself."""
-        return self
 
     def project(self, views: Views) -> tuple[torch.Tensor, torch.Tensor]:
         """Line integrals (B, D) [V, H, W] float64 [m], means over pixels along the rows of what its rays pass."""

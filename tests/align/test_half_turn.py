@@ -19,6 +19,12 @@ SHAPE, COUNT, OFFSET = (21, 63), 60, 2.3
 SHORT, WHOLE = np.arange(COUNT) * 180.0 / COUNT, np.linspace(0, 180, COUNT)
 
 
+@pytest.fixture(autouse=True)
+def _unjudged(monkeypatch) -> None:
+    """What frames say of the axis is not held against unseen views, as tests/align/test_axis.py does."""
+    monkeypatch.setattr("holosplat.align.axis._judged", lambda axis, *given: axis)
+
+
 def scan_of(true, said, noise=0.002, drift=0.0) -> Scan:
     """Balls in contact at angles `true` [degrees], of which the scan says `said`; drift: of light, first to last."""
     views = Views.from_angles(true, SHAPE, PITCH)

@@ -150,7 +150,7 @@ def test_interrupting_the_command(tmp_path, monkeypatch, capsys):
     def interrupted(*arguments: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("holosplat.cli.grow.run", interrupted)
+    monkeypatch.setattr("holosplat.cli.imaging.grow_cells", interrupted)
     monkeypatch.setattr(sys, "argv", ["holosplat", "grow", "--out", str(tmp_path / "series")])
     with pytest.raises(SystemExit) as stopped:
         main()

@@ -20,8 +20,7 @@ from holosplat.specimens.phantoms import Ball
 from holosplat.specimens.rods import RodScene
 from holosplat.specimens.scene import MeshScene
 from holosplat.tables import merged
-from holosplat_bench.suite.case import FOLDER, Case, case_names, load_case
-from holosplat_bench.suite.declared import declared_names
+from holosplat_bench.suite.case import FOLDER, Case, case_names, declared_names, load_case
 
 SLOW = ("crowded12",)
 """Scenes that take seconds to make: that they follow their seed is tested on smaller ones (test_specimens_phantoms)."""

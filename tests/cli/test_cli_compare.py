@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from helpers.cli import COLUMNS, PIXEL, ROWS, Workshop, holosplat, refused, worked
-from holosplat.cli.view import _side
+from holosplat.cli.scans import side_of_run
 from holosplat.inference import Decision
 from holosplat.metrics import fourier_shell_correlation
 from holosplat.report.compare import Comparison, chosen, differing, in_columns
@@ -54,7 +54,7 @@ def test_a_name_that_is_decided_again_keeps_its_choices_in_order():
 
 def test_volumes_of_other_pixels_are_compared_on_one_grid(shop, coarse):
     """Of the larger pixels, over the fields of both; the correlation is that of the two volumes there."""
-    found = Comparison(_side(shop.run), _side(coarse))
+    found = Comparison(side_of_run(shop.run), side_of_run(coarse))
     assert found.grid.shape == (-(-COLUMNS // 2), -(-ROWS // 2), -(-COLUMNS // 2))
     assert found.grid.voxel_size[0] == pytest.approx(2 * PIXEL)
     first, second = found.volumes

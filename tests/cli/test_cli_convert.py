@@ -114,7 +114,7 @@ def test_r2_gaussian_there_and_back(scan, tmp_path, known):
         (("--to", "nerf-synthetic", "--truth", "t.h5"), "--truth goes with --to r2-gaussian"),
         (("--to", "tiff", "--black", "0.1"), "black: not for a source in nxtomo"),
         (("--to", "r2-gaussian", *MATERIAL, "--truth", "none.h5"), "no such file"),
-        (("--to", "nerf-synthetic", "--camera-distance", "1"), "camera_distance must lie between"),
+        (("--to", "nerf-synthetic", "--camera-distance", "1"), "camera_distance must be at least 10"),
         (("--to", "jpeg"), "invalid choice"),
         ((), "required"),
     ],

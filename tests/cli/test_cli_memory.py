@@ -8,9 +8,10 @@ import sys
 
 import pytest
 
+import holosplat.cli as start
 from helpers.cli import PROGRAM
 from holosplat import native
-from holosplat.cli import entry, start
+from holosplat.cli import entry
 from holosplat.io.room import UNLIMITED
 
 

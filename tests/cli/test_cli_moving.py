@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from helpers.cli import holosplat, worked
+from holosplat.cli import scans
 from holosplat.cli import track as motion
 from holosplat.fit.run import Run
 from holosplat.io.nxtomo import read_scan
@@ -50,7 +51,7 @@ def quick(monkeypatch, tmp_path):
         (tmp_path / "remark").write_text(what[-1], encoding="utf-8")
         return tmp_path / "run/report.html"
 
-    monkeypatch.setattr(motion, "report_run", report)
+    monkeypatch.setattr(scans, "report_run", report)
     blob = ["--specimen", "stirred-blob", "--material", "PMMA", "--specimen-motion", 40, "--frame-rate", 1e3]
     field = ["--frames", 3, "--detector", 15, 19, "--pixel-size", "1e-6", "--distance", 0.1, "--views", 3]
     truth = ["--photons-per-pixel", 2000, "--test-every", 0, "--truth", tmp_path / "t.h5", "--truth-frames", 0, 2]

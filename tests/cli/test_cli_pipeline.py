@@ -14,10 +14,9 @@ from pathlib import Path
 import pytest
 
 from helpers.cli import Workshop, everything_in, holosplat, refused, worked
-from holosplat.cli.entry import command
+from holosplat.cli.entry import OF_ONE_CALL, command
 from holosplat.cli.help import options_of, parser_of
 from holosplat.cli.pipeline import STAGES
-from holosplat.cli.resume import OF_ONE_CALL
 from holosplat.io.provenance import records
 
 CUT_SHORT = """

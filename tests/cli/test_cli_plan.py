@@ -132,7 +132,7 @@ def test_one_range_is_enough_and_needs_no_file(tmp_path):
         (["--photons-per-pixel", 0], ["--photons-per-pixel"]),
         (["--views", 0], ["views", "0"]),
         (["--detector", 0, 5], ["--detector", "0"]),
-        (["--bit-depth", 65], ["bit_depth", "65"]),
+        (["--bit-depth", 65], ["--bit-depth", "65"]),
         (["--velocity", -1], ["velocity", "-1"]),
         (["--frame-rate", "1e6", "--exposure", "1e-3"], ["exposure", "0.001", "1e-06"]),
         (["--diameter", 8], ["--diameter", "8", "metres"]),

@@ -15,7 +15,7 @@ import pytest
 
 from helpers.cli import Workshop, holosplat, known, refused, worked
 from holosplat.cli import entry
-from holosplat.cli.resume import is_made_by
+from holosplat.cli.entry import is_made_by
 from holosplat.io import hdf5_guard, provenance
 from holosplat.io.provenance import from_home, home_safe, records
 

@@ -11,10 +11,9 @@ import pytest
 
 import holosplat as hs
 from helpers.cli import holosplat, refused, worked
-from holosplat.cli import view
 from holosplat.io.atomic import read_json, write_json
 from holosplat.methods.volume import SmoothVolume
-from holosplat.show.parts import LEVEL, likely_surfaces
+from holosplat.show.parts import LEVEL, likely_surfaces, objects_of
 from holosplat.workflows import certainty, rehearsal
 
 
@@ -94,7 +93,7 @@ def test_the_map_of_matter_is_exported_and_viewed(run, tmp_path, monkeypatch):
         assert file["matter"].dtype == np.float32
         assert file["matter"][()] == pytest.approx(likely.values, abs=1e-6)
         assert file["views"][()].max() == 3  # one is held out
-    objects, _, slider = view._objects(run)
+    objects, _, slider = objects_of(run)
     assert slider == "shown"
     shown = [label for label in objects if label]
     assert shown == list(likely_surfaces(likely))

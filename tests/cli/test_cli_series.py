@@ -93,7 +93,7 @@ def test_a_collection_is_the_same_series(folder, tmp_path):
 
 def test_one_time_of_a_series_is_reconstructed_and_judged(folder, tmp_path, monkeypatch):
     """Without its report, which takes seconds to draw."""
-    monkeypatch.setattr("holosplat.report.run.report_run", lambda *what: tmp_path / "run/report.html")
+    monkeypatch.setattr("holosplat.cli.scans.report_run", lambda *what: tmp_path / "run/report.html")
     options = ["--frame-rate", 5e5, "--views", 4, "--truth-frames", 2, "--truth", tmp_path / "t.h5"]
     worked(holosplat("simulate", folder, *BEAM, *options, "--out", tmp_path / "s.nxs"))
     (tmp_path / "quick.json").write_text(json.dumps(to_table(QUICK)))

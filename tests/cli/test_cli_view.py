@@ -13,9 +13,8 @@ import pytest
 
 from helpers.cli import holosplat, known, refused, worked
 from holosplat.cli import view as commands
-from holosplat.io.compact import Steps
 from holosplat.io.lock import sole_writer
-from holosplat.io.objects import read_object, write_series
+from holosplat.io.objects import Steps, read_object, write_series
 from holosplat.show import server
 
 

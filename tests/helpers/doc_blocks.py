@@ -45,14 +45,17 @@ def given(page: str) -> list[str]:
     return [name for found in GIVEN.findall(page) for name in re.findall(r"`([\w.]+)`", found)]
 
 
-def run(page: str, folder: Path, readme: Path | None = None) -> None:
-    """Run the blocks of a page in a folder, in their order; a block that fails ends it with what it said."""
+def run(page: str, folder: Path, readme: Path | None = None, shell: Path | None = None) -> None:
+    """Run the blocks of a page in a folder, in their order; a block that fails ends it with what it said.
+
+    shell: a file that shells read before.
+    """
     for name in given(page):
         assert readme is not None
         shutil.copy(readme / name, folder)
     for block in blocks(page):
         if block.runs:
-            run_block(block, folder)
+            run_block(block, folder, shell)
 
 
 def run_block(block: Block, folder: Path, shell: Path | None = None) -> None:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from helpers.doc_blocks import FAR, Block
+from holosplat.methods import Auto
+from holosplat.tables import to_table
 
 SCENE = "--detector 16 16 --views 4 --test-every 4"
 SCAN = f"holosplat simulate --specimen bubbles --material haemoglobin --pixel-size 2e-6 {SCENE} --out"
@@ -179,3 +183,15 @@ PAGES: dict[str, Small] = {
     "verdict.md": Small(f"{RUN} run && cp -r run another_run"),
 }
 """Pages whose blocks that do not run as they stand are run so. What is missing was not seen to work at a small size."""
+
+
+def of_few_steps(folder: Path) -> Path:
+    """A file in a folder that shells read before blocks of any page: their commands take few steps of fits, and try few
+    instruments."""
+    method, shell = folder / "method.json", folder / "shell.sh"
+    method.write_text(json.dumps(to_table(Auto().with_effort(0.1))), encoding="utf-8")
+    fits = f"""$(case "$*" in *--method*|*--preset*) ;; *) echo --config {method} ;; esac)"""
+    series = """$(case "$2" in plan) echo --preset fast ;; esac)"""
+    more = {"plan": "--points 5 3", "reconstruct": fits, "series": series, "track": TRACK}
+    shell.write_text(Small(more=more).shell(), encoding="utf-8")
+    return shell

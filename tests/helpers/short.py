@@ -1,6 +1,8 @@
-"""Fits of a few steps, which explain no frames: a smooth volume would begin again with weaker priors, in vain.
+"""Fits of a few steps: smooth volumes that would begin again with weaker priors, in vain, for a few steps explain no
+frames; and the likelihood of δ/β.
 
-tests/methods/test_volume.py holds that priors are weakened, and that a fit that was stopped goes on with them.
+tests/methods/test_volume.py holds that priors are weakened, and that a fit that was stopped goes on with them, and
+tests/methods/test_uncertain.py what the likelihood finds.
 """
 
 from __future__ import annotations
@@ -8,10 +10,19 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Iterator
+from functools import partial
 
 import pytest
 
-from holosplat.methods import smooth_fit
+from holosplat.baselines import HolographicTV
+from holosplat.methods import levels, smooth_fit
+from holosplat.methods.profile import ProfileOptions
+from holosplat.methods.uncertain import likeliest_ratio
+
+QUICK = ProfileOptions(
+    iterations=5, start=HolographicTV(retrieval=15, iterations=30, corrections=0, noisy=1.0, refine=1, upper=0.0)
+)
+"""Volumes of few steps, whose likelihood says what that of the usual ones does of small frames without noise."""
 
 
 @contextlib.contextmanager
@@ -20,4 +31,12 @@ def in_one_go() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(smooth_fit, "EXPLAINED", math.inf)
         patch.setattr(smooth_fit, "WEAKER", math.inf)
+        yield
+
+
+@contextlib.contextmanager
+def in_few_steps() -> Iterator[None]:
+    """Within, the likeliest δ/β of frames is that of `QUICK` volumes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(levels, "likeliest_ratio", partial(likeliest_ratio, options=QUICK))
         yield

@@ -264,3 +264,29 @@ def test_changed_options_must_exist(scripts):
     assert found.schedule.steps == tune.VoxelFit().schedule.steps  # its own steps are what a name means
     with pytest.raises(KeyError, match="VoxelFit has no option flour"):
         scripts["changes"].changed(tune.VoxelFit(), {"flour": 0.3})
+
+
+def test_the_conformal_quantile_covers_what_it_says(scripts):
+    conformal_quantile = scripts["calibrate_intervals"].conformal_quantile
+    assert conformal_quantile(np.arange(9.0), 0.9) == 8
+    assert conformal_quantile(np.arange(8.0), 0.9) == np.inf
+    assert conformal_quantile(np.arange(99.0), 0.9) == 89
+    draws = np.random.default_rng(0).exponential(size=(2000, 40))
+    inside = [each[-1] <= conformal_quantile(each[:-1], 0.9) for each in draws]
+    assert np.mean(inside) == pytest.approx(0.9, abs=0.02)
+
+
+def test_the_floor_is_that_of_the_shortest_intervals_and_they_cover_scenes_that_were_not_seen(scripts):
+    """Errors of scenes good and bad, of their scale: good ones get intervals as short as their own would be."""
+    fitted_factor = scripts["calibrate_intervals"].fitted_factor
+    rng, inside, short = np.random.default_rng(1), [], []
+    for _ in range(300):
+        scales = np.exp(rng.choice([-4.0, 0.0], 60, p=[0.4, 0.6]) + 0.3 * rng.normal(size=60))
+        errors = scales * rng.normal(size=60)
+        floor, factor = fitted_factor(errors[:-20], scales[:-20])
+        reach = factor * (scales[-20:] + floor)
+        inside.extend(np.abs(errors[-20:]) <= reach)
+        short.append(reach[scales[-20:] < 0.1].mean())
+    assert np.mean(inside) == pytest.approx(0.9, abs=0.02)
+    assert np.mean(short) < 0.15
+    assert fitted_factor(np.array([0.0, 2.0]), np.array([0.0, 1.0])) == (1.0, 1.0)

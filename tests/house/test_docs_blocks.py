@@ -1,5 +1,7 @@
 """Every block of code in the README and the guide runs as it stands, in an empty folder, on data that blocks make.
 
+Fits of commands take few steps (`helpers.doc_small.of_few_steps`), and figures of reports are blank but in the README.
+
 Blocks of the lab notebook (docs/notebook) are parsed only: they show how numbers were made.
 
 A block that begins with a comment such as `# needs network` or `# takes hours` (`helpers.doc_blocks.EXCUSE`) does not
@@ -20,6 +22,7 @@ import pytest
 
 from helpers.doc_blocks import FAR, Block, blocks, given, misparsed, run, run_block
 from helpers.doc_small import PAGES as PAGES_SMALL
+from helpers.doc_small import of_few_steps
 from helpers.forked import served
 from holosplat.methods.presets import read_method
 
@@ -60,10 +63,16 @@ def _of_these_tests() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def readme(tmp_path_factory) -> Path:
+def few_steps(tmp_path_factory) -> Path:
+    """What a shell reads before a block: commands whose fits take few steps."""
+    return of_few_steps(tmp_path_factory.mktemp("shell"))
+
+
+@pytest.fixture(scope="module")
+def readme(few_steps, tmp_path_factory) -> Path:
     """The folder in which all blocks of the README were run."""
     folder = tmp_path_factory.mktemp("readme")
-    run(TEXTS[README], folder)
+    run(TEXTS[README], folder, shell=few_steps)
     return folder
 
 
@@ -74,8 +83,9 @@ def test_the_blocks_of_the_readme_run(readme):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", RUN, ids=name_of)
-def test_the_blocks_of_a_page_run(page, readme, tmp_path):
-    run(TEXTS[page], tmp_path, readme)
+def test_the_blocks_of_a_page_run(page, readme, few_steps, tmp_path, monkeypatch):
+    monkeypatch.setenv("UNDRAWN", "1")
+    run(TEXTS[page], tmp_path, readme, few_steps)
 
 
 @pytest.mark.slow

@@ -11,8 +11,8 @@ import torch
 from helpers.splats import cloud
 from holosplat.checks import InputError
 from holosplat.geometry import Grid
-from holosplat.io.compact import FORMAT, Steps, steps_of
-from holosplat.io.objects import read_object, write_compact, write_object
+from holosplat.io.objects import COMPACT as FORMAT
+from holosplat.io.objects import Steps, read_object, steps_of, write_compact, write_object
 from holosplat.io.ome import write_ome_tiff
 from holosplat.matter import DeltaBeta, Matter
 from holosplat.representations import GaussianCloud, MovingSurfaces, Stored, SurfaceMesh, VoxelGrid

@@ -9,8 +9,7 @@ import torch
 
 from helpers.splats import cloud
 from holosplat.checks import InputError
-from holosplat.io.compact import Steps
-from holosplat.io.objects import names_of, read_object, read_series, write_compact, write_series
+from holosplat.io.objects import Steps, names_of, read_object, read_series, write_compact, write_series
 from holosplat.matter import DeltaBeta, Matter
 from holosplat.representations import GaussianCloud, Stored, SurfaceMesh
 from holosplat.representations.gaussians import raw_of

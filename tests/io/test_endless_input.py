@@ -19,8 +19,7 @@ from holosplat.geometry import Grid
 from holosplat.io.beams import MOST_VIEWS, read_beams
 from holosplat.io.formats import read_volume_file
 from holosplat.io.larger_frames import Tube
-from holosplat.io.leftovers import LOCK
-from holosplat.io.lock import sole_writer, writer_of
+from holosplat.io.lock import LOCK, sole_writer, writer_of
 from holosplat.io.ome import read_ome_tiff, write_ome_tiff
 from holosplat.io.paraview import find_snapshots, read_pvd
 from holosplat.io.reading import Reading, ends_of, marked, read_angles

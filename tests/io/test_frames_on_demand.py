@@ -13,12 +13,11 @@ import numpy as np
 import pytest
 
 import holosplat.frames as frames_module
-import holosplat.io.raw_file as raw_file
-import holosplat.io.stored_frames as stored_frames
 from holosplat.checks import InputError
 from holosplat.frames import Binned, Frames, Picked, divided
 from holosplat.geometry import Views, rotation_y
 from holosplat.io.nxtomo import RawLayout, read_scan, scan_writer, write_scan
+from holosplat.io.raw_file import ScanFile
 from holosplat.scan import Exposures, Scan
 from holosplat.workflows.provenance import scan_hash
 
@@ -43,14 +42,13 @@ def stored(tmp_path: Path) -> Path:
 @pytest.fixture
 def reads(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """The numbers of the frames that were read from files so far."""
-    numbers, read = [], stored_frames.rows_of
+    numbers, read = [], ScanFile.rows
 
-    def counted(stacks: object, number: int, *rest) -> np.ndarray:
+    def counted(file: ScanFile, number: int, rows: slice) -> np.ndarray:
         numbers.append(number)
-        return read(stacks, number, *rest)
+        return read(file, number, rows)
 
-    for module in (raw_file, stored_frames):
-        monkeypatch.setattr(module, "rows_of", counted)
+    monkeypatch.setattr(ScanFile, "rows", counted)
     return numbers
 
 

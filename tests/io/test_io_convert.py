@@ -234,7 +234,7 @@ def test_folders_of_other_programs_are_read_with_what_they_do_not_say(tmp_path):
     own = read_nerf_synthetic(tmp_path / "out")
     head = read(tmp_path / "out/transforms_train.json")["holosplat"]
     folder = without_ours(tmp_path / "out", "transforms_train.json", "transforms_test.json")
-    with pytest.raises(InputError, match="give the photon energy"):
+    with pytest.raises(InputError, match="does not say the photon energy"):
         read_nerf_synthetic(folder)
     found = read_nerf_synthetic(folder, GivenOptics(20.1, 0.3, PIXEL, head["low"], head["high"]))
     order = np.concatenate([np.flatnonzero(~measured.is_test), np.flatnonzero(measured.is_test)])

@@ -131,7 +131,7 @@ def test_r2_gaussian_folders_of_others_are_read(tmp_path):
     for entry in (meta, *meta["proj_train"], *meta["proj_test"]):
         entry.pop("holosplat")
     (folder / "meta_data.json").write_text(json.dumps(meta))
-    with pytest.raises(InputError, match="give both"):
+    with pytest.raises(InputError, match="say them by --energy-kev and --pixel-size"):
         read_r2_gaussian(folder)
     found = read_r2_gaussian(folder, 20.0, PIXEL)
     lines = blob(centre, 2.2).project(found.views)[1].detach().numpy() / DELTA / (16 * PIXEL)

@@ -14,13 +14,13 @@ import h5py
 import numpy as np
 import pytest
 
-import holosplat.io.seal as module
+import holosplat.io.hdf5_guard as module
 from holosplat.checks import InputError
 from holosplat.geometry import Views
 from holosplat.io import read_scan
 from holosplat.io.hdf5 import new_hdf5, put
+from holosplat.io.hdf5_guard import ENDING, MAGIC, require_sealed, seal, summed
 from holosplat.io.nxtomo import write_scan
-from holosplat.io.seal import ENDING, MAGIC, require_sealed, seal, summed
 from holosplat.scan import Exposures, Scan
 from holosplat.workflows.run_folder import check
 

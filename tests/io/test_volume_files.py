@@ -45,7 +45,7 @@ def test_what_cannot_be_is_refused(tmp_path):
     (tmp_path / "broken.tif").write_bytes(b"II*\0 nothing")
     for names, meaning, match in (
         (["a.tif"], None, "of a specimen, --voxel-size says it"),
-        (["rgb.tif"], MEANING, "must hold grey images of one size"),
+        (["rgb.tif"], MEANING, "must hold grey images of numbers"),
         (["nan.tif"], MEANING, "finite numbers"),
         (["broken.tif"], MEANING, "damaged or none|must hold grey images"),
         (["none.tif"], MEANING, "there is none"),

@@ -31,7 +31,7 @@ from holosplat.workflows.run_illumination import EVEN, light_options_of
 
 MATTER = DeltaBeta(4e-7, 4e-7 / 1500)
 PIXEL, SHAPE, VIEWS = 1.5e-6, (31, 36), 8
-PRIOR = MaterialPrior.of_ratio(MATTER.ratio)
+PRIOR = MaterialPrior.of_ratio(MATTER.ratio, 1)  # on which side matter lies is for other tests
 
 
 def of(scene, photons: float | None = None) -> Scan:

@@ -38,6 +38,7 @@ from holosplat.methods import (
 )
 from holosplat.methods.coarse import CoarseToFine
 from holosplat.model import Instrument, Model
+from holosplat.optics.background import LightOptions
 from holosplat.representations import KINDS, AlignedNetwork, Stored
 from holosplat.scan import Scan
 
@@ -66,11 +67,13 @@ LEAST_BY_RATIO = {**LEAST, "gaussians": 0.5, "surfaces": 0.7, "onix": 0.85}
 """δ is estimated at 0.6 of the balls' there, by which overfull Gaussians lose matter in their first steps."""
 REPEATED = {"surfaces": "known", "auto": "ratio"}
 """With which prior a method runs twice, where that is not `unknown`."""
+EVEN = LightOptions("even", noise="white")
+"""What light decides where less is known is for other tests."""
 KNOWN = MaterialPrior.known(ONE.channels[0])
 PRIORS = {"known": KNOWN, "ratio": MaterialPrior.of_ratio(ONE.channels[0].ratio), "unknown": MaterialPrior.unknown()}
 
 
-pytestmark = pytest.mark.usefixtures("begun_once")
+pytestmark = pytest.mark.usefixtures("begun_once", "quick_likelihood")
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +104,8 @@ def test_a_method_makes_an_object_that_predicts_frames(name, prior, measured):
     if name == "surfaces" and prior == "unknown":
         pytest.skip("surfaces need one material: the refusal has its own test")
     told: list[tuple[str, float]] = []
-    task = Task(measured.train(), PRIORS[prior], 3, lambda stage, done: told.append((stage, done)))
+    light = LightOptions() if prior == "known" else EVEN
+    task = Task(measured.train(), PRIORS[prior], 3, lambda stage, done: told.append((stage, done)), light=light)
     found = solve(QUICK[name], task)
     assert isinstance(found, KINDS[found.kind])
     frames, truth = predicted(found, measured), measured.test().frames

@@ -128,7 +128,7 @@ STEPS = {"neural-field": 0.3, "gaussians": 0.3, "voxels": 0.3}
         ("paganin-sirt", 0.35),
     ],
 )
-def test_every_method_of_continuous_matter_finds_both_sides(name, most, scan, pair):
+def test_every_method_of_continuous_matter_finds_both_sides(name, most, scan, pair, unjudged_runs):
     scan = of(pair, views=COARSE) if name == "neural-field" else scan  # whose samples take long
     method = METHODS[name].with_effort(STEPS.get(name, 1.0))
     light = LightOptions("even", still="none", noise="white")

@@ -11,15 +11,15 @@ import torch
 
 from helpers.blobs import MATERIAL as BLOBS
 from helpers.blobs import SHAPE, blob_scan
+from helpers.short import QUICK
 from helpers.soft import DISTANCE, MATERIAL, PIXEL, two_cells
-from holosplat.baselines import HolographicTV
 from holosplat.baselines.beyond import rows_beyond
 from holosplat.checks import InputError
 from holosplat.inference import Score
 from holosplat.matter import MaterialPrior
 from holosplat.methods import Task
 from holosplat.methods.method import first_of_task
-from holosplat.methods.profile import Profile, ProfileOptions, exposed, without_specks
+from holosplat.methods.profile import Profile, exposed, without_specks
 from holosplat.methods.uncertain import (
     Determined,
     Search,
@@ -32,9 +32,6 @@ from holosplat.methods.uncertain import (
 )
 
 RATIO = MaterialPrior.of_ratio(MATERIAL.ratio)
-QUICK = ProfileOptions(
-    iterations=5, start=HolographicTV(retrieval=15, iterations=30, corrections=0, noisy=1.0, refine=1, upper=0.0)
-)
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +71,7 @@ def ratio_of(scan) -> float:
     return first_of_task(Task(scan, MaterialPrior.unknown())).material.ratio
 
 
-def test_the_search_begins_at_the_estimate_within_the_range(scan, monkeypatch):
+def test_the_search_begins_at_the_estimate_within_the_range(scan, begun_once, monkeypatch):
     """Of δ/β, and of nothing else: a distance begins in the middle of its range."""
     tried = list[dict[str, float]]()
 

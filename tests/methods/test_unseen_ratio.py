@@ -20,12 +20,14 @@ from holosplat.methods.illumination import prepared
 from holosplat.methods.levels import TrialFits, decide_ratio, ratio_of_one
 from holosplat.methods.method import first_of_task, one_material
 from holosplat.methods.uncertain import Determined
-from holosplat.optics.background import FLUX
+from holosplat.optics.background import FLUX, LightOptions
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.red_cells import random_cells
 from holosplat.specimens.scene import MeshScene
 from holosplat.specimens.soft_matter import soft_cells
 from holosplat.workflows.preconditions import decided_before, decisions_of
+
+pytestmark = pytest.mark.usefixtures("begun_once")
 
 MATERIAL = DeltaBeta(4e-7, 4e-7 / 1500)
 PIXEL, SHAPE = 1.4e-6, (33, 38)  # rectangular, and odd
@@ -72,8 +74,7 @@ def test_absorption_is_taken_where_it_predicts_unseen_views(kind, true, likelies
         assert decision.line == found.remark
 
 
-@pytest.mark.parametrize("absorption", [0.1, 10.0])
-@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(("absorption", "sign"), [(0.1, -1), (10.0, 1)])
 def test_first_volumes_find_the_ratio_by_unseen_views(absorption, sign):
     """Within the step of the ratios that are tried, and of holes as of bodies."""
     delta = sign * MATERIAL.delta
@@ -109,15 +110,19 @@ def test_first_volumes_decide_where_the_likelihood_tells_none_or_is_not_asked(mo
     assert alone.material.ratio == pytest.approx(volumes.ratio[0])
 
 
+IN_FLUX = LightOptions(still="none", noise="white")
+"""Neither a pattern nor grain is looked for, which are for other tests."""
+
+
 def in_unequal_flux(scan: Scan) -> Scan:
     """Frames that pass for those of matter that absorbs, as long as their light is even."""
     flux = 1 + 0.02 * (-1.0) ** np.arange(9)[:, None, None]
     return replace(scan, frames=(scan.frames * flux).astype(np.float32))
 
 
-def test_a_run_that_goes_on_has_the_ratio_that_was_decided(soft):
+def test_a_run_that_goes_on_has_the_ratio_that_was_decided(soft, quick_likelihood):
     """And so the same light: that of frames as they were measured may be another one."""
-    task = Task(in_unequal_flux(soft), MaterialPrior.unknown(1))
+    task = Task(in_unequal_flux(soft), MaterialPrior.unknown(1), light=IN_FLUX)
     assert first_of_task(task).ratio[0] < 0.5 * LIKELY_RATIOS[1]
     done = prepared(task)
     again = prepared(task, before=decided_before(decisions_of(done)))
@@ -160,10 +165,10 @@ def test_a_ratio_is_found_again_in_other_light(soft, monkeypatch):
     assert len(asked) == 2
 
 
-def test_matter_that_absorbs_in_unequal_flux_does_both():
+def test_matter_that_absorbs_in_unequal_flux_does_both(quick_likelihood):
     """What frames as measured hide is found once the light is known."""
     dark = measured(bodies(DeltaBeta(MATERIAL.delta, 10 * MATERIAL.beta)))
-    done = prepared(Task(in_unequal_flux(dark), MaterialPrior.unknown(1)))
+    done = prepared(Task(in_unequal_flux(dark), MaterialPrior.unknown(1), light=IN_FLUX))
     assert done.first is not None
     assert done.first.taken == (FLUX,)
     found = ratio_of_one(done, done.first)

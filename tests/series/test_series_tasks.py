@@ -43,7 +43,7 @@ def test_a_time_that_finds_no_memory_says_so(error):
     def fail() -> str:
         raise error
 
-    assert attempted(fail).startswith("the memory of this machine is not enough; take larger pixels")
+    assert attempted(fail)[1].startswith("the memory of this machine is not enough; take larger pixels")
 
 
 def test_times_have_runs_and_rows(done, files):

@@ -8,7 +8,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from holosplat.checks import InputError
-from holosplat.training.folder import Dataset, Scenes
+from holosplat.training.folder import Dataset, Scenes, tensors_of
 from holosplat.training.options import Ranges
 from holosplat.training.sample import Sample, sample_of
 
@@ -54,9 +54,9 @@ def test_a_folder_gives_the_same_scenes(tmp_path):
     dataset = Dataset(tmp_path / "data", TINY, 3, 1)
     dataset.begin()
     with pytest.raises(InputError, match="lacks 1 of 1 files"):
-        Scenes.of_folder(dataset.folder)
+        Dataset.read(dataset.folder).require_whole()
     dataset.make(dataset.missing()[0])
 
-    kept, drawn = Scenes.of_folder(dataset.folder)[0], Scenes(TINY, 3)[0]
+    kept, drawn = tensors_of(Dataset.read(dataset.folder).sample(0)), Scenes(TINY, 3)[0]
 
     assert all(torch.equal(kept[name], drawn[name]) for name in Sample.names())

@@ -18,8 +18,7 @@ from holosplat.checks import InputError
 from holosplat.io import lock
 from holosplat.io.atomic import atomic_folder, atomic_path, is_taken
 from holosplat.io.hdf5 import new_hdf5, put
-from holosplat.io.leftovers import LOCK, host, temporary_name
-from holosplat.io.lock import sole_writer
+from holosplat.io.lock import LOCK, host, sole_writer, temporary_name
 from holosplat.workflows.provenance import MANIFEST, faults
 from holosplat.workflows.run_folder import RunFolder, check, claimed
 

@@ -26,9 +26,7 @@ from holosplat.workflows import Reconstruction, RunFolder, certainty, rehearsal
 from holosplat.workflows.certainty import (
     NULL,
     Factor,
-    conformal_quantile,
     errors_of,
-    fitted_factor,
     scale_of,
     true_sizes,
 )
@@ -77,33 +75,9 @@ def test_errors_of_the_truth_are_none_and_those_of_changes_are_as_large_as_these
     assert moved["dice"] == pytest.approx(1 - both / inside.sum(), abs=1e-6)
 
 
-def test_the_conformal_quantile_covers_what_it_says():
-    assert conformal_quantile(np.arange(9.0), 0.9) == 8
-    assert conformal_quantile(np.arange(8.0), 0.9) == np.inf
-    assert conformal_quantile(np.arange(99.0), 0.9) == 89
-    draws = np.random.default_rng(0).exponential(size=(2000, 40))
-    inside = [each[-1] <= conformal_quantile(each[:-1], 0.9) for each in draws]
-    assert np.mean(inside) == pytest.approx(0.9, abs=0.02)
-
-
 def test_scales_are_root_mean_squares_and_that_of_a_resolution_is_the_mean():
     assert scale_of("total", np.array([0.3, -0.4])) == pytest.approx(np.sqrt(0.125))
     assert scale_of("resolution", np.array([1.0, 3.0])) == 2.0
-
-
-def test_the_floor_is_that_of_the_shortest_intervals_and_they_cover_scenes_that_were_not_seen():
-    """Errors of scenes good and bad, of their scale: good ones get intervals as short as their own would be."""
-    rng, inside, short = np.random.default_rng(1), [], []
-    for _ in range(300):
-        scales = np.exp(rng.choice([-4.0, 0.0], 60, p=[0.4, 0.6]) + 0.3 * rng.normal(size=60))
-        errors = scales * rng.normal(size=60)
-        floor, factor = fitted_factor(errors[:-20], scales[:-20])
-        reach = factor * (scales[-20:] + floor)
-        inside.extend(np.abs(errors[-20:]) <= reach)
-        short.append(reach[scales[-20:] < 0.1].mean())
-    assert np.mean(inside) == pytest.approx(0.9, abs=0.02)
-    assert np.mean(short) < 0.15
-    assert fitted_factor(np.array([0.0, 2.0]), np.array([0.0, 1.0])) == (1.0, 1.0)
 
 
 def test_sizes_whose_measurement_is_found_are_those_that_the_errors_allow():

@@ -221,7 +221,19 @@ def _by_moments(
     scan: Scan, options: AxisOptions, ratio: float | None, light: LightOptions, on_progress: Advance
 ) -> Axis:
     """The axis that moments, or frames half a turn apart, tell."""
-    sinograms = sinograms_of(scan, options, ratio, light)
+    views = scan.views
+    scan.views.parallel("finding the rotation axis")
+    require(
+        views.shares_axis,
+        "the axis is that of views which turn about the object's y axis alone, but these do not; align without "
+        "--axis-only.",
+    )
+    chosen = evenly(len(scan), options.views)
+    require(
+        len(chosen) >= FEWEST_VIEWS,
+        f"an axis needs {FEWEST_VIEWS} views at least, but there are {len(chosen)}; align without --axis-only.",
+    )
+    sinograms = _sinograms(scan[chosen], options, ratio, light)
     pairs, found = MirroredPairs.of(sinograms), None
     try:
         found = _search_axis(scan, sinograms, options, on_progress)
@@ -282,23 +294,6 @@ def _search_axis(scan: Scan, sinograms: Sinograms, options: AxisOptions, on_prog
     fine = AxisSearch.of(sinograms, near, reach, STEP * pitch, lambda f: on_progress(0.5 + 0.5 * f))
     offset, leaning = fine.found(lean)
     return Axis(offset, leaning, _middle(scan) + offset.value, scan.views.shape[0])
-
-
-def sinograms_of(scan: Scan, options: AxisOptions, ratio: float | None, light: LightOptions) -> Sinograms:
-    """The sinograms of `scan`, in bands of rows; errors: those of `find_axis`."""
-    views = scan.views
-    scan.views.parallel("finding the rotation axis")
-    require(
-        views.shares_axis,
-        "the axis is that of views which turn about the object's y axis alone, but these do not; align without "
-        "--axis-only.",
-    )
-    chosen = evenly(len(scan), options.views)
-    require(
-        len(chosen) >= FEWEST_VIEWS,
-        f"an axis needs {FEWEST_VIEWS} views at least, but there are {len(chosen)}; align without --axis-only.",
-    )
-    return _sinograms(scan[chosen], options, ratio, light)
 
 
 def _sinograms(scan: Scan, options: AxisOptions, ratio: float | None, light: LightOptions) -> Sinograms:

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from ..checks import InputError, at_least, in_range, require
 from ..geometry import Views
@@ -14,15 +13,15 @@ from ..matter import Known, MaterialPrior
 from ..mesh import TriangleMesh
 from ..model import Alignment, Instrument
 from ..optics.background import LightOptions
-from ..optics.retrieval import Tikhonov, paganin, tikhonov
+from ..optics.retrieval import paganin
 from ..optics.sampling import fringe_sampling
 from ..progress import Progress
 from ..ranges import Pixels, checked_dataclass
 from ..scan import Exposures, Scan
-from .derivatives import NUMBERS, changes, header, line, moved_onto, unexplained
-from .initial_geometry import shifts_by_mass
+from .derivatives import NUMBERS, changes, header, line, moved_onto, rms_of, unexplained
+from .initial_geometry import retrieved, shifts_by_mass
 from .phantom import STEPS, Linear, Phantom, find_beads, linearised, placed, solved
-from .poses import DISTANCE, FLUX, SHIFT, TURN, PosePrior
+from .poses import DISTANCE, FLUX, SHIFT, TURN, PosePrior, aligned
 from .views import EVEN_OR_NOT, KINDS, in_even_light
 
 UNTOLD = 0.5
@@ -194,10 +193,7 @@ class _Search:
 
     def exposures(self, planned: Exposures) -> Exposures:
         """Planned exposures, on pixels of any size, corrected by the numbers as they are now."""
-        pixels = planned.views.pixel_size / self.scan.views.pixel_size
-        alignment = Alignment(
-            self.numbers[:, TURN], self.numbers[:, SHIFT] / pixels, self.numbers[:, DISTANCE].exp() - 1
-        )
+        alignment = aligned(self.numbers, planned.views.pixel_size / self.scan.views.pixel_size)
         found, larger = alignment.exposures(planned), float(np.exp(self.size))
         views = replace(found.views, pitch=found.views.pitch * larger, shifts=found.views.shifts * larger)
         return replace(found, views=views)
@@ -229,19 +225,14 @@ class _Search:
         if self.phantom.free:
             by = after.of_all[: len(places)].reshape(-1, 3).numpy() * exposures.views.pixel_size
             self.phantom = self.phantom.shifted(by)
-        self._note(frames, found.frames, after.covariances, scales, len(places))
+        deviations = after.covariances.diagonal().clamp_min(0).sqrt()
+        own = (deviations[len(deviations) - self.numbers.numel() :].reshape(self.numbers.shape) * scales).numpy()
+        self.errors = own[:, :FLUX] * np.array([1, 1, *[np.rad2deg(1)] * 3, 1, 1])
+        self.size_error = float(deviations[len(places)]) if self.options.pixel > 0 else 0.0
+        self.left = rms_of(unexplained(frames, found.frames))
         if pixel > 0:
             self.size = float(after.of_all[-1])
         self._centre()
-
-    def _note(self, frames: Tensor, seen: Tensor, covariances: Tensor, scales: Tensor, places: int) -> None:
-        """Errors of the numbers, and what is unexplained."""
-        deviations = covariances.diagonal().clamp_min(0).sqrt()
-        own = (deviations[len(deviations) - self.numbers.numel() :].reshape(self.numbers.shape) * scales).numpy()
-        self.errors = own[:, :FLUX] * np.array([1, 1, *[np.rad2deg(1)] * 3, 1, 1])
-        self.size_error = float(deviations[places]) if self.options.pixel > 0 else 0.0
-        left = unexplained(frames, seen).square().mean((1, 2)).sqrt()
-        self.left = left.double().numpy()
 
     def _centre(self) -> None:
         """The motion that all views share goes to the phantom: `x_lab = R x - s` stays what it is."""
@@ -282,10 +273,9 @@ class _Search:
 
 def _thickness(scan: Scan, prior: Known, options: CalibrationOptions) -> np.ndarray:
     """Retrieved thickness [V, H, W] [m], without what is faint."""
-    frames = torch.from_numpy(scan.frames)
     if options.retrieval:
-        how = Tikhonov(iterations=options.retrieval)
-        found = tikhonov(frames, scan.exposures, *prior.material, options=how, missing=scan.gaps).double().numpy()
+        thickness = retrieved(scan, prior.material, options.retrieval)
     else:
-        found = paganin(frames, scan.exposures, *prior.material, missing=scan.gaps).double().numpy()
+        thickness = paganin(torch.from_numpy(scan.frames), scan.exposures, *prior.material, missing=scan.gaps)
+    found = thickness.double().numpy()
     return np.where(found > FAINT * found.max(axis=(1, 2), keepdims=True), found, 0.0)

@@ -167,9 +167,15 @@ def step(normal: Normal, numbers: Tensor, expected: Tensor) -> Step:
 
 def blurred(images: Tensor, sigma: float) -> Tensor:
     """Images [..., H, W] convolved with a Gaussian of `sigma` [pixels], periodically."""
-    h, w = images.shape[-2:]
-    squares = torch.fft.fftfreq(h)[:, None] ** 2 + torch.fft.rfftfreq(w) ** 2
-    return torch.fft.irfft2(torch.fft.rfft2(images) * torch.exp(-2 * math.pi**2 * sigma**2 * squares), s=(h, w))
+    raster = images.shape[-2:]
+    return torch.fft.irfft2(torch.fft.rfft2(images) * gaussian(raster, sigma), s=raster)
+
+
+def gaussian(raster: tuple[int, ...], sigma: float) -> Tensor:
+    """The half-spectrum [..., N // 2 + 1] of a Gaussian of `sigma` [samples] on a periodic `raster` [..., N]."""
+    axes = [*(torch.fft.fftfreq(count) for count in raster[:-1]), torch.fft.rfftfreq(raster[-1])]
+    squares = torch.stack(torch.meshgrid(*axes, indexing="ij")).square().sum(0)
+    return torch.exp(-2 * math.pi**2 * sigma**2 * squares)
 
 
 def unexplained(measured: Tensor, images: Tensor) -> Tensor:

@@ -20,12 +20,12 @@ from ..fit.problem import Schedule
 from ..geometry import Grid
 from ..matter import DeltaBeta, Matter
 from ..methods.surface_fit import SurfaceFit, oversampling, surface_fit
-from ..model import Alignment, Instrument, Model
+from ..model import Instrument, Model
 from ..progress import Advance
 from ..representations import Stored, SurfaceMesh, isosurface
 from ..scan import Exposures, Scan
 from .derivatives import NUMBERS, Normal, Predicted, Step, numbers_of, step, unexplained
-from .poses import DISTANCE, FLUX, PoseOptions
+from .poses import DISTANCE, FLUX, MAGNIFICATION, PoseOptions, aligned
 
 SMALL = (0.05, 0.05, 1e-3, 1e-3, 1e-3, 0.01, 1e-3)
 """Steps by which derivatives of frames are taken: shifts [pixels], turns [rad], logarithms of distance and
@@ -36,12 +36,6 @@ STEPS = 3
 """Newton's steps, from poses that are right to some tenths of a pixel."""
 SAMPLES = 4_000_000
 """Wave samples of the frames that are made together: some hundred megabytes."""
-
-
-def aligned(numbers: Tensor) -> Alignment:
-    """The corrections that `numbers` [V, 8] of `NUMBERS` are."""
-    magnified = numbers[:, 6].exp() - 1 if bool((numbers[:, 6] != 0).any()) else None
-    return Alignment(numbers[:, 2:5], numbers[:, :2], numbers[:, 5].exp() - 1, magnified=magnified)
 
 
 class Beside:
@@ -102,7 +96,7 @@ class Beside:
         """
         found = Step(numbers, torch.zeros(len(numbers), len(NUMBERS), len(NUMBERS), dtype=torch.float64))
         for done in range(max(1, steps)):
-            normal = Normal.of(measured, self.predicted(found.numbers, bool(expected[6] > 0)), BLUR)
+            normal = Normal.of(measured, self.predicted(found.numbers, bool(expected[MAGNIFICATION] > 0)), BLUR)
             moved = step(normal, found.numbers, expected)
             found = moved if steps else replace(moved, numbers=numbers)
             tell((done + 1) / max(1, steps))
@@ -160,8 +154,7 @@ def sharpened(scan: Scan, numbers: Tensor, start: SurfaceMesh, search: PoseOptio
     found = numbers.clone()
     found[train, :FLUX] = numbers_of(model.alignment.exposures(begin.exposures), scan.exposures[train])
     beside = Beside(model.object, scan.exposures, oversampling(begin, options))
-    expected = uncertain.deviations()
-    expected[DISTANCE] = uncertain.distance
+    expected = uncertain.deviations(sharp=True)
     moved = beside.placed(frames, found, expected, tell=lambda part: on_progress(FITTED + (1 - FITTED) * part))
     after = moved.numbers.clone()
     if not freedom.tells_mean(begin.exposures):  # these are moved by what the mean of the others was kept from

@@ -10,14 +10,13 @@ from torch import Tensor
 
 from ..geometry import Grid
 from ..matter import DeltaBeta
-from ..optics.retrieval import Tikhonov, tikhonov
 from ..optics.sampling import fringe_sampling
 from ..progress import Progress
 from ..representations import Stored
 from ..scan import Scan
 from .derivatives import NUMBERS, changes, in_pixels, numbers_of, rms_of, unexplained
 from .fixed_matter import Beside
-from .initial_geometry import centres_of_mass
+from .initial_geometry import centres_of_mass, retrieved
 from .poses import DISTANCE, FLUX, SHIFT, PoseOptions, PoseSearch
 from .views import AlignedViews, errors_of
 
@@ -50,7 +49,9 @@ def place_frames(
     done, rounds = 0, sum(level.rounds for level in levels)
     for level in levels:
         binned = scan.binned(level.pixels)
-        occupied, grid = _occupancy(found, binned, material)
+        with torch.no_grad():
+            delta = found.voxelise(Grid.of_views(binned.views)).delta
+        occupied, grid = torch.from_numpy(delta / material.delta).float(), Grid.of_views(in_pixels(binned.views))
         frames, oversample = binned.measured, fringe_sampling(binned.exposures)
         for _ in range(level.rounds):
             search.move(occupied, grid, search.exposures(binned.exposures), frames, oversample)
@@ -59,7 +60,7 @@ def place_frames(
     search.numbers[:, DISTANCE] = 0
     beside = Beside(found, scan.exposures, oversample or fringe_sampling(scan.exposures))
     measured, nothing = scan.measured, torch.zeros_like(search.numbers)
-    moved = beside.placed(measured, search.numbers, _expected(options))
+    moved = beside.placed(measured, search.numbers, options.uncertain.deviations(sharp=True))
     tried = [
         rms_of(unexplained(measured, beside.frames(numbers))) for numbers in (nothing, search.numbers, moved.numbers)
     ]
@@ -82,28 +83,13 @@ def place_frames(
     )
 
 
-def _occupancy(found: Stored, scan: Scan, material: DeltaBeta) -> tuple[Tensor, Grid]:
-    """δ over that of `material` on the field of view of `scan`, and its grid with lengths in pixels."""
-    with torch.no_grad():
-        delta = found.voxelise(Grid.of_views(scan.views)).delta
-    return torch.from_numpy(delta / material.delta).float(), Grid.of_views(in_pixels(scan.views))
-
-
 def _by_mass(found: Stored, scan: Scan, material: DeltaBeta, options: PoseOptions) -> Tensor:
     """Shifts [V, 2] [pixels of `scan`] that bring the centres of mass of frames to those of the matter."""
-    how = Tikhonov(iterations=options.retrieval)
-    thickness = tikhonov(torch.from_numpy(scan.frames), scan.exposures, *material, options=how, missing=scan.gaps)
+    thickness = retrieved(scan, material, options.retrieval)
     with torch.no_grad():
         _, lines = found.project(scan.views)
     expected, seen = (centres_of_mass(images.double().numpy()) for images in (lines, thickness))
     return torch.from_numpy(expected - seen)
-
-
-def _expected(options: PoseOptions) -> Tensor:
-    """Standard deviations [7] of the numbers of a view; 0 for what stays."""
-    expected = options.uncertain.deviations()
-    expected[DISTANCE] = options.uncertain.distance
-    return expected
 
 
 def fitted_frames(found: Stored, planned: Scan, fitted: Scan, options: PoseOptions, oversample: int) -> AlignedViews:
@@ -115,7 +101,8 @@ def fitted_frames(found: Stored, planned: Scan, fitted: Scan, options: PoseOptio
     numbers[:, :FLUX] = numbers_of(fitted.exposures, planned.exposures)
     measured, nothing = fitted.measured, torch.zeros_like(numbers)
     beside = Beside(found, planned.exposures, oversample or fringe_sampling(planned.exposures))
-    errors = errors_of(beside.placed(measured, numbers, _expected(options), steps=0).covariances)
+    expected = options.uncertain.deviations(sharp=True)
+    errors = errors_of(beside.placed(measured, numbers, expected, steps=0).covariances)
     before, after = (rms_of(unexplained(measured, beside.frames(each))) for each in (nothing, numbers))
     moved = changes(fitted.exposures, planned.exposures)
     return AlignedViews(fitted.exposures, moved, errors, np.zeros(len(planned)), before, after, ())

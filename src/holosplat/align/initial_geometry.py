@@ -23,6 +23,12 @@ SIDES = {"x": (-1,), "y": (-2,), "xy": (-1, -2)}
 """Names of mirror images, and the axes that are reversed."""
 
 
+def retrieved(scan: Scan, material: DeltaBeta, steps: int) -> Tensor:
+    """Thickness [V, H, W] [m] of `material` in the frames of `scan`, in so many steps."""
+    how = Tikhonov(iterations=steps)
+    return tikhonov(torch.from_numpy(scan.frames), scan.exposures, *material, options=how, missing=scan.gaps)
+
+
 def shifts_by_mass(thickness: np.ndarray, views: Views) -> np.ndarray:
     """Detector shifts [V, 2] [pixels] beside those of `views` that bring all centres of mass to one point of space.
 
@@ -106,12 +112,9 @@ class Images:
     @classmethod
     def of(cls, scans: Sequence[Scan], when: Sequence[float], material: DeltaBeta, steps: int) -> Images:
         """Retrieved in `steps`, of scans of the same views."""
-        how, first = Tikhonov(iterations=steps), scans[0]
-        found = [
-            tikhonov(torch.from_numpy(scan.frames), scan.exposures, *material, options=how, missing=scan.gaps)
-            for scan in scans
-        ]
-        values = torch.stack(found).double().numpy() / first.views.pitch
+        first = scans[0]
+        found = torch.stack([retrieved(scan, material, steps) for scan in scans])
+        values = found.double().numpy() / first.views.pitch
         return cls(values, in_pixels(first.views), first.is_test, np.asarray(when))
 
     def passing(self) -> bool:
@@ -154,7 +157,8 @@ def geometry_from_rows(images: Images, expected: np.ndarray, drifts: np.ndarray,
     found = images.estimate(prior, train)
     told = RowInformation.of(found.information, images.views[train], expected)
     whole = images.estimate(_of_others(found, free, images.is_test), everything)
-    errors, rate_errors = _errors(whole), np.zeros((len(images.views), len(free)))
+    variances = np.diag(whole.covariance).reshape(2, len(whole.numbers), -1)[0, :, :FACTOR]
+    errors, rate_errors = np.sqrt(np.maximum(variances, 0)), np.zeros((len(images.views), len(free)))
     errors[train] = told.errors
     rate_errors[train] = RowInformation.of(found.rate_information, images.views[train], prior.drifts).errors
     errors[:, free == 0] = expected[free == 0]
@@ -178,12 +182,6 @@ def _of_others(found: RowEstimate, free: np.ndarray, is_test: np.ndarray) -> Row
     begin = np.zeros((2, len(is_test), found.numbers.shape[1]))
     begin[:, ~is_test] = found.numbers, found.rates
     return RowPrior(np.where(is_test[:, None], free, 0.0), np.zeros(len(free)), begin)
-
-
-def _errors(found: RowEstimate) -> np.ndarray:
-    """[V, 5] of the numbers by the covariance."""
-    variances = np.diag(found.covariance).reshape(2, len(found.numbers), -1)[0, :, :FACTOR]
-    return np.sqrt(np.maximum(variances, 0))
 
 
 def _upright(

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 from ..geometry import Grid, Views
 from ..inference import Decision
@@ -19,7 +18,7 @@ from ..optics.sampling import fringe_sampling
 from ..projectors.voxels import LatticeProjector
 from ..representations import SurfaceMesh
 from ..scan import Exposures
-from .derivatives import beside, blurred, in_pixels, motions, null, predicted, projections
+from .derivatives import beside, blurred, gaussian, in_pixels, motions, null, predicted, projections
 from .fixed_matter import BLUR
 from .poses import DISTANCE, FLUX, MAGNIFICATION, PoseSearch
 
@@ -62,12 +61,15 @@ class Following:
         views, (delta, beta) = exposures.views, material
         self._projector = LatticeProjector(grid, in_pixels(views))
         of_waves = response(exposures.optical, beta / delta, Raster(views.shape, views.pitch))
-        down, across = torch.fft.fftfreq(views.shape[0])[:, None], torch.fft.rfftfreq(views.shape[1])
-        blurring = torch.exp(-2 * math.pi**2 * blur**2 * (down**2 + across**2))
-        self._waves = (-of_waves * blurring * views.pitch / radian(exposures, delta)).float()
-        self._field = _white(_gaussian(grid.shape, leeway.width), grid.shape)
-        near = _filtered(volume, _gaussian(grid.shape, 1.0)).clamp(0, 1)
-        self._deviations = leeway.edges * _slope(near) + leeway.insides * near
+        self._waves = (-of_waves * gaussian(views.shape, blur) * views.pitch / radian(exposures, delta)).float()
+        transform = gaussian(grid.shape, leeway.width)
+        point = torch.zeros(grid.shape)
+        point[0, 0, 0] = 1
+        self._field = transform / _filtered(point, transform).norm()  # keeps the variance of white noise
+        near = _filtered(volume, gaussian(grid.shape, 1.0)).clamp(0, 1)
+        self._deviations = (
+            leeway.edges * torch.stack(torch.gradient(near)).square().sum(0).sqrt() + leeway.insides * near
+        )
 
     def frames(self, lines: Tensor) -> Tensor:
         """Changes of frames [..., V, H, W] by those of line integrals [pixels]; symmetric."""
@@ -111,16 +113,6 @@ def of_poses(
     powers = [columns.flatten(0, 1)]
     for _ in range(DEPTH):
         powers.append(torch.stack([root * follows.spread(root * image) for image in _unit(powers[-1])]))
-    return _quadratic(powers)
-
-
-def _unit(images: Tensor) -> Tensor:
-    """Each image over its length."""
-    return images / images.flatten(1).norm(dim=1).clamp_min(1e-30)[:, None, None, None]
-
-
-def _quadratic(powers: list[Tensor]) -> Tensor:
-    """`Cᵀ (1 + K)⁻¹ C` on the span of all but the last of `powers`: C, and K times the one before, made unit."""
     units = torch.cat([_unit(part) for part in powers[:-1]]).flatten(1).double()
     spread = torch.cat(powers[1:]).flatten(1).double()
     inner, moved = units @ units.T, units @ spread.T
@@ -132,27 +124,13 @@ def _quadratic(powers: list[Tensor]) -> Tensor:
     return across @ torch.linalg.solve(middle, across.T)
 
 
-def _gaussian(shape: tuple[int, ...], sigma: float) -> Tensor:
-    """The transform of a Gaussian on a periodic raster."""
-    z, y, x = torch.fft.fftfreq(shape[0]), torch.fft.fftfreq(shape[1]), torch.fft.rfftfreq(shape[2])
-    squares = z[:, None, None] ** 2 + y[:, None] ** 2 + x**2
-    return torch.exp(-2 * math.pi**2 * sigma**2 * squares)
-
-
-def _white(transform: Tensor, shape: tuple[int, ...]) -> Tensor:
-    """So scaled that white noise of variance 1 keeps its variance."""
-    point = torch.zeros(shape)
-    point[0, 0, 0] = 1
-    return transform / _filtered(point, transform).norm()
+def _unit(images: Tensor) -> Tensor:
+    """Each image over its length."""
+    return images / images.flatten(1).norm(dim=1).clamp_min(1e-30)[:, None, None, None]
 
 
 def _filtered(field: Tensor, transform: Tensor) -> Tensor:
     return torch.fft.irfftn(torch.fft.rfftn(field) * transform, s=field.shape)
-
-
-def _slope(field: Tensor) -> Tensor:
-    """Its length, by central differences."""
-    return torch.stack(torch.gradient(field)).square().sum(0).sqrt()
 
 
 NAME, NONE = "errors of the plan", "none"
@@ -308,7 +286,7 @@ def _information(
     scan = search.scan.binned(pixels)
     exposures, grid = search.exposures(scan.exposures)[train], Grid.of_views(in_pixels(scan.views))
     if surfaces is None:
-        volume = interpolate(search.volume[None, None], size=grid.shape, mode="trilinear", align_corners=False)[0, 0]
+        volume = search.volume_on(grid)
     else:
         with torch.no_grad():
             delta = surfaces.voxelise(Grid.of_views(scan.views)).delta

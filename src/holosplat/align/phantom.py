@@ -19,13 +19,12 @@ from ..geometry import Grid, Views
 from ..matter import DeltaBeta, Matter
 from ..mesh import TriangleMesh, joined
 from ..model import Alignment, Instrument
-from ..optics.noise import left_of
 from ..projectors.surface import surface_occupancy
 from ..representations import SurfaceMesh
 from ..scan import Exposures
-from ..specimens.red_cells import icosphere
+from ..specimens.phantoms import unit_ball
 from ..volume import LineIntegrals
-from .derivatives import NUMBERS, blurred, in_pixels
+from .derivatives import NUMBERS, Normal, Predicted, in_pixels, step
 from .initial_geometry import centres_of_mass, shifts_by_mass
 
 FINENESS = 3
@@ -56,9 +55,8 @@ class Phantom:
     @classmethod
     def of_beads(cls, places: np.ndarray, radius: float) -> Phantom:
         """Balls of `radius` [m] at `places` [N, 3] [m], as polyhedra of their volume."""
-        vertices, faces = icosphere(FINENESS)
+        vertices, faces = unit_ball(FINENESS)
         ball = TriangleMesh(positive("the beads' radius", radius, "metres") * vertices, faces, "bead")
-        ball = replace(ball, vertices=ball.vertices * (4 / 3 * np.pi * radius**3 / ball.volume) ** (1 / 3))
         require(len(places) > 0, "a phantom of beads needs one bead at least; check --beads and the material.")
         return cls((ball,) * len(places), np.array(places, dtype=np.float64), np.eye(3), True)
 
@@ -232,12 +230,12 @@ def linearised(phantom: Phantom, exposures: Exposures, material: DeltaBeta, over
 
     here = seen(lines.channels)
     columns = []
-    for k, step in enumerate(STEPS):
+    for k, change in enumerate(STEPS):
         name, width = ("shifts", 2) if k < 2 else ("turns", 3)
         changed = torch.zeros(count, width, dtype=torch.float64)
-        changed[:, k if k < 2 else k - 2] = step
+        changed[:, k if k < 2 else k - 2] = change
         poses = Alignment(**{name: changed}).poses(instrument.poses, pitch)
-        columns.append((seen(matter.project(poses).channels) - here) / step)
+        columns.append((seen(matter.project(poses).channels) - here) / change)
     farther = Instrument(replace(exposures, distance=exposures.distance * math.exp(STRETCH)), oversample)
     columns += [(seen(lines.channels, farther) - here) / STRETCH, torch.zeros_like(here), here]
     others = []
@@ -277,29 +275,15 @@ def solved(
     Gaussian of `blur` [pixels].
     """
     views, count = len(measured), len(numbers[1])
-    known = ~measured.isnan()
-    missing = blurred(left_of(measured.double(), found.frames), blur).flatten(1)
-    of_views = blurred(found.of_views * known[:, None], blur).flatten(2)
-    of_all = (blurred(found.of_all * known, blur) if count else found.of_all).flatten(2)
-    independent = 1 / (4 * math.pi * blur**2)
-    scale = independent / (missing.square().sum(1) / known.sum((1, 2))).clamp_min(1e-18)
-    size = count + len(NUMBERS) * views
-    information, slope = torch.zeros(size, size, dtype=torch.float64), torch.zeros(size, dtype=torch.float64)
-    information[:count, :count] = torch.einsum("kvp,lvp,v->kl", of_all, of_all, scale)
-    slope[:count] = torch.einsum("kvp,vp,v->k", of_all, missing, scale)
+    columns = torch.cat([found.of_all.transpose(0, 1), found.of_views], dim=1)
+    of_each = Normal.of(measured.double(), Predicted(found.frames, columns), blur)
+    size, own = count + len(NUMBERS) * views, torch.arange(len(NUMBERS))
+    both = Normal(torch.zeros(1, size, size, dtype=torch.float64), torch.zeros(1, size, dtype=torch.float64))
     for v in range(views):
-        at = slice(count + len(NUMBERS) * v, count + len(NUMBERS) * (v + 1))
-        information[at, at] = scale[v] * of_views[v] @ of_views[v].T
-        information[:count, at] = scale[v] * of_all[:, v] @ of_views[v].T
-        information[at, :count] = information[:count, at].T
-        slope[at] = scale[v] * of_views[v] @ missing[v]
+        at = torch.cat([torch.arange(count), count + len(NUMBERS) * v + own])
+        both.information[0, at[:, None], at] += of_each.information[v]
+        both.slope[0, at] += of_each.slope[v]
     flat = torch.cat([numbers[1], numbers[0].flatten()])
-    deviations = torch.cat([expected[1], expected[0].repeat(views)])
-    free = torch.nonzero(deviations > 0)[:, 0]
-    prior = deviations[free] ** -2
-    covariance = torch.linalg.inv(information[free[:, None], free] + torch.diag(prior))
-    after = flat.clone()
-    after[free] += covariance @ (slope[free] - prior * flat[free])
-    whole = torch.zeros(size, size, dtype=torch.float64)
-    whole[free[:, None], free] = covariance
+    moved = step(both, flat[None], torch.cat([expected[1], expected[0].repeat(views)]))
+    after, whole = moved.numbers[0], moved.covariances[0]
     return Solution(after[count:].reshape(views, len(NUMBERS)), after[:count], whole)

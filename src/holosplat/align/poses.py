@@ -16,17 +16,23 @@ from ..fit.pose_refinement import PoseRefinement
 from ..geometry import Grid
 from ..matter import DeltaBeta
 from ..model import Alignment
-from ..optics.retrieval import Tikhonov, tikhonov
 from ..optics.sampling import fringe_sampling
 from ..progress import Advance
 from ..projectors.voxels import LatticeProjector
 from ..ranges import Angle, Pixels, Weight, checked_dataclass
 from ..scan import Exposures, Scan
 from .derivatives import NUMBERS, Normal, in_pixels, predicted, step, unexplained
-from .initial_geometry import shifts_by_mass
+from .initial_geometry import retrieved, shifts_by_mass
 
 SHIFT, TURN, DISTANCE, MAGNIFICATION, FLUX = slice(0, 2), slice(2, 5), 5, 6, 7
 """Places of the numbers of `NUMBERS`."""
+
+
+def aligned(numbers: Tensor, pixels: float = 1.0) -> Alignment:
+    """The corrections that `numbers` [V, 8] of `NUMBERS` are, in pixels that are so many times larger."""
+    magnified = numbers[:, MAGNIFICATION].exp() - 1 if bool((numbers[:, MAGNIFICATION] != 0).any()) else None
+    shifts, stretches = numbers[:, SHIFT] / pixels, numbers[:, DISTANCE].exp() - 1
+    return Alignment(numbers[:, TURN], shifts, stretches, magnified=magnified)
 
 
 @checked_dataclass
@@ -58,11 +64,12 @@ class PosePrior:
         turns = np.deg2rad([self.angle, self.angle, self.roll])
         return np.array([self.shift / pixels, self.shift / pixels, *turns])
 
-    def deviations(self, turning: bool = True) -> Tensor:
+    def deviations(self, turning: bool = True, sharp: bool = False) -> Tensor:
         """Standard deviations [8] of `NUMBERS`, shifts in detector pixels; turning: whether turns and magnification,
-        which act far from the middle, are free."""
+        which act far from the middle, are free; sharp: whether the matter's edges are, so that a distance which is
+        known need not be free (`BLUR_AS_DISTANCE`)."""
         turn, roll = np.deg2rad([self.angle, self.roll]) * turning
-        distance = self.distance or BLUR_AS_DISTANCE
+        distance = self.distance if sharp else self.distance or BLUR_AS_DISTANCE
         found = [self.shift, self.shift, turn, turn, roll, distance, self.magnification * turning, self.flux]
         return torch.tensor(found, dtype=torch.float64)
 
@@ -183,12 +190,7 @@ class PoseSearch:
 
     def exposures(self, planned: Exposures) -> Exposures:
         """Planned exposures, on pixels of any size, corrected by the numbers as they are now."""
-        pixels = planned.views.pitch / self.scan.views.pitch
-        stretches = self.numbers[:, DISTANCE].exp() - 1
-        magnified = self.numbers[:, MAGNIFICATION].exp() - 1 if self.options.uncertain.magnification > 0 else None
-        shifts = self.numbers[:, SHIFT] / pixels
-        alignment = Alignment(self.numbers[:, TURN], shifts, stretches, magnified=magnified)
-        return alignment.exposures(planned)
+        return aligned(self.numbers, planned.views.pitch / self.scan.views.pitch).exposures(planned)
 
     def levels(self) -> tuple[Level, ...]:
         """All levels, in their order."""
@@ -197,10 +199,7 @@ class PoseSearch:
     def begin(self) -> None:
         """Shifts by centres of mass, for a start; turns and distances as planned."""
         scan = self.scan.binned(self.levels()[0].pixels)
-        how = Tikhonov(iterations=self.options.retrieval)
-        thickness = tikhonov(
-            torch.from_numpy(scan.frames), scan.exposures, *self.material, options=how, missing=scan.gaps
-        )
+        thickness = retrieved(scan, self.material, self.options.retrieval)
         shifts = shifts_by_mass(thickness.double().numpy(), scan.views)
         pixels = scan.views.pitch / self.scan.views.pitch
         self.numbers[:, SHIFT] = torch.from_numpy(shifts) * pixels
@@ -211,11 +210,19 @@ class PoseSearch:
         assert self._solver is not None
         return self._solver.volume
 
+    def volume_on(self, grid: Grid) -> Tensor:
+        """The same on a grid of the same extent, between its voxels."""
+        return interpolate(self.volume[None, None], size=grid.shape, mode="trilinear", align_corners=False)[0, 0]
+
     def residuals(self, scan: Scan) -> Tensor:
         """[V, H, W] what the volume leaves of the frames of `scan`, on its pixels, over their contrast."""
+        return unexplained(scan.measured, self.frames(scan))
+
+    def frames(self, scan: Scan) -> Tensor:
+        """[V, H, W] what the volume predicts of the frames of `scan`, on pixels of any size."""
         grid, found = Grid.of_views(in_pixels(scan.views)), self.exposures(scan.exposures)
-        images = predicted(self.volume, grid, found, self.material, fringe_sampling(scan.exposures)).frames
-        return unexplained(scan.measured, self.numbers[:, FLUX].exp().float()[:, None, None] * images)
+        images = predicted(self.volume_on(grid), grid, found, self.material, fringe_sampling(scan.exposures)).frames
+        return self.numbers[:, FLUX].exp().float()[:, None, None] * images
 
     def run(self, level: Level, on_progress: Advance) -> None:
         """The rounds of a level, until steps of the shifts are within their standard errors, or fall no longer."""
@@ -241,30 +248,26 @@ class PoseSearch:
         """Inputs of the rounds of a level."""
         scan = self.scan.binned(level.pixels)
         planned = scan.exposures
-        retrieved = self.thickness(scan, planned) / scan.views.pitch
         grid = Grid.of_views(in_pixels(planned.views))
-        return Prepared(scan, retrieved, grid, fringe_sampling(planned))
+        return Prepared(scan, self.thickness(scan) / scan.views.pitch, grid, fringe_sampling(planned))
 
     def looked(self, at: Prepared) -> Normal:
         """Some steps of the volume, and what the frames then say of the numbers."""
         found = self.exposures(at.scan.exposures)
         train = np.flatnonzero(~at.scan.is_test)
         self._improve_volume(LatticeProjector(at.grid, in_pixels(found.views)[train]), at)
-        assert self._solver is not None
-        return self.normal(self._solver.volume, at.grid, found, at.scan.measured, at.oversample)
+        return self.normal(self.volume, at.grid, found, at.scan.measured, at.oversample)
 
-    def thickness(self, scan: Scan, exposures: Exposures) -> Tensor:
-        """Retrieved thickness [m] of the training frames of `scan`, on pixels of any size, in `exposures`.
+    def thickness(self, scan: Scan) -> Tensor:
+        """Retrieved thickness [m] of the training frames of `scan`, on pixels of any size.
 
         Poses do not matter to it, distances and pixels do: at those planned it is kept for later.
         """
         pixels = round(scan.views.pitch / self.scan.views.pitch)
-        as_planned = np.array_equal(exposures.optical.distance, self.scan.exposures.optical.distance)
+        as_planned = np.array_equal(scan.exposures.optical.distance, self.scan.exposures.optical.distance)
         if as_planned and pixels in self._retrieved:
             return self._retrieved[pixels]
-        train, how = scan[np.flatnonzero(~scan.is_test)], Tikhonov(iterations=self.options.retrieval)
-        seen = exposures[np.flatnonzero(~scan.is_test)]
-        found = tikhonov(torch.from_numpy(train.frames), seen, *self.material, options=how, missing=train.gaps)
+        found = retrieved(scan[np.flatnonzero(~scan.is_test)], self.material, self.options.retrieval)
         if as_planned:
             self._retrieved[pixels] = found
         return found
@@ -281,8 +284,7 @@ class PoseSearch:
         if before.volume.shape == torch.Size(grid.shape):
             self._solver = before.on_finer(projector, 1, options.weight)
         else:
-            finer = interpolate(before.volume[None, None], size=grid.shape, mode="trilinear", align_corners=False)
-            self._solver = PrimalDual(projector, finer[0, 0], options.weight, self.upper)
+            self._solver = PrimalDual(projector, self.volume_on(grid), options.weight, self.upper)
             self._solver.run(iterations=max(0, first - steps), **seen)
         self._solver.run(iterations=steps, **seen)
 

@@ -214,7 +214,8 @@ def conditions(rows: Rows, angles: np.ndarray, weights: tuple[float, float]) -> 
     views best: so motions of the whole object stay undetermined.
     """
     count, height = rows.mass.shape
-    across, along = _directions(angles)
+    c, s = np.cos(angles), np.sin(angles)
+    across, along = np.stack([c, s], axis=1), np.stack([-s, c], axis=1)
     flat = _products(across, across)
     slices = np.linalg.lstsq(across, rows.first, rcond=1e-6)[0]
     tensor = np.linalg.lstsq(flat, rows.second, rcond=1e-6)[0]
@@ -231,12 +232,6 @@ def conditions(rows: Rows, angles: np.ndarray, weights: tuple[float, float]) -> 
         residuals.append(weight * (left @ values).reshape(-1))
         columns.append(weight * np.einsum("uv,vhk->uhvk", left, parts).reshape(-1, count, COUNT))
     return np.concatenate(residuals), np.concatenate(columns)
-
-
-def _directions(angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of views at angles [V] about y, in the object's (x, z): their columns' direction [V, 2], and the beam's."""
-    c, s = np.cos(angles), np.sin(angles)
-    return np.stack([c, s], axis=1), np.stack([-s, c], axis=1)
 
 
 def _products(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 from ..baselines.primal_dual import PrimalDual
 from ..checks import require
@@ -34,6 +33,7 @@ from .derivatives import (
     moved_onto,
     numbers_of,
     predicted,
+    rms_of,
     unexplained,
 )
 from .fixed_matter import EDGES, SURFACES, VOXELS, Beside, sharpened, surfaces_of
@@ -117,17 +117,11 @@ def rehearsed(done: Searched, again: ScanSearch) -> np.ndarray:
 
 def _frames(done: Searched, scan: Scan) -> Tensor:
     """Frames [V, H, W] of what was found, on the pixels of `scan`."""
-    search = done.search
-    scales = torch.ones(search.numbers.shape[1], dtype=torch.float64)
+    if done.surfaces is None:
+        return done.search.frames(scan)
+    scales = torch.ones(done.search.numbers.shape[1], dtype=torch.float64)
     scales[SHIFT] = done.pixels
-    if done.surfaces is not None:
-        beside = Beside(done.surfaces, scan.exposures, oversampling(scan))
-        return beside.frames(search.numbers / scales)
-    grid = Grid.of_views(in_pixels(scan.views))
-    volume = interpolate(search.volume[None, None], size=grid.shape, mode="trilinear", align_corners=False)[0, 0]
-    lit = search.numbers[:, FLUX].exp().float()[:, None, None]
-    found = search.exposures(scan.exposures)
-    return lit * predicted(volume, grid, found, search.material, fringe_sampling(scan.exposures)).frames
+    return Beside(done.surfaces, scan.exposures, oversampling(scan)).frames(done.search.numbers / scales)
 
 
 def with_random_phases(images: Tensor, seed: int) -> Tensor:
@@ -233,8 +227,8 @@ def align_still(
         wrong = beside_unknown(search, pixels, surfaces, rehearsed(done, again))
     errors = errors_of(search.covariances)
     errors[:, 2:4] = np.maximum(errors[:, 2:4], held)
-    expected = options.uncertain.deviations()
-    expected[DISTANCE] = options.uncertain.distance if sharp else 0.0
+    expected = options.uncertain.deviations(sharp=True)
+    expected[DISTANCE] *= sharp
     words += hardly_told(search.covariances, expected)
     found = search.exposures(scan.exposures)
     found = replace(found, views=moved_onto(found.views, scan.views))
@@ -338,14 +332,14 @@ class Judged:
         """On pixels `pixels` times larger; the same for all exposures that are compared."""
         scan = scan.taken(exposures).binned(pixels)
         frames, train, options = scan.measured, np.flatnonzero(~scan.is_test), search.options
-        lines = search.thickness(scan, scan.exposures) / scan.views.pitch
+        lines = search.thickness(scan) / scan.views.pitch
         views = in_pixels(scan.views)
         grid = Grid.of_views(views)
         solver = PrimalDual(LatticeProjector(grid, views[train]), torch.zeros(grid.shape), options.weight, search.upper)
         solver.run(lines, 2 * options.first, scan[train].gaps)
         images = predicted(solver.volume, grid, scan.exposures, search.material, fringe_sampling(scan.exposures)).frames
         left = unexplained(frames, images)
-        return cls(left.double().square().mean((1, 2)).sqrt().numpy(), mirrored(frames, images), left)
+        return cls(rms_of(left), mirrored(frames, images), left)
 
 
 def _doubts(judged: Judged) -> list[str]:

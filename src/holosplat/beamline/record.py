@@ -110,10 +110,15 @@ def record(
     require_apart(truth or out, source)
     _require_corrected(source)
     scan = part.of(read(source))
-    _require_noise_free(source, scan)
+    photons = scan.provenance.get("photons_per_pixel", "none")
+    require(
+        photons == "none",
+        f"{source} must be noise-free, but it has the noise of {photons} photons; simulate it without.",
+    )
     bench = _Bench.drawn(scan, options, camera, light)
-    upright = RawLayout(_kinds(options, len(scan)), _mask(bench.sensor))
-    layout = replace(upright, mask=_flipped(upright.mask, options.flip), flips=FLIPS[options.flip])
+    kinds = np.repeat([DARK, FLAT, PROJECTION], [options.darks, options.flats, len(scan)])
+    mask = DEAD_BIT * bench.sensor.dead.astype(np.uint32) + HOT_BIT * bench.sensor.hot.astype(np.uint32)
+    layout = RawLayout(kinds, _flipped(mask, options.flip), flips=FLIPS[options.flip])
     exposures, is_test = _all_frames(scan, options, camera)
     provenance = scan.provenance | _provenance(options, camera, light)
     saturated = 0
@@ -143,15 +148,6 @@ def _require_corrected(source: Path) -> None:
     require(only, f"{source} must hold projections only, but it has flats, darks or invalid frames: it is raw already.")
 
 
-def _require_noise_free(source: Path, scan: Scan) -> None:
-    """`InputError` for frames with photon noise."""
-    photons = scan.provenance.get("photons_per_pixel", "none")
-    require(
-        photons == "none",
-        f"{source} must be noise-free, but it has the noise of {photons} photons; simulate it without.",
-    )
-
-
 def _photons(bench: _Bench, scan: Scan, options: RecordingOptions, number: int) -> np.ndarray:
     """Photons [H, W] expected in frame `number` of all: darks first, then flats, then projections."""
     shape = scan.views.shape
@@ -164,10 +160,6 @@ def _photons(bench: _Bench, scan: Scan, options: RecordingOptions, number: int) 
     return options.photons_per_pixel * bench.model.light(bench.projections, projection) * relative
 
 
-def _kinds(options: RecordingOptions, projections: int) -> np.ndarray:
-    return np.repeat([DARK, FLAT, PROJECTION], [options.darks, options.flats, projections])
-
-
 def _all_frames(scan: Scan, options: RecordingOptions, camera: Camera) -> tuple[Exposures, np.ndarray]:
     """Exposures and split of all frames; darks and flats, which have no pose, repeat those of the first projection."""
     before, exposures = options.darks + options.flats, scan.exposures
@@ -175,10 +167,6 @@ def _all_frames(scan: Scan, options: RecordingOptions, camera: Camera) -> tuple[
     index = np.concatenate([np.zeros(before, dtype=int), np.arange(len(exposures))])
     is_test = np.concatenate([np.zeros(before, dtype=bool), scan.is_test])
     return replace(exposures, psf_sigma_px=blurred)[index], is_test
-
-
-def _mask(sensor: Sensor) -> np.ndarray:
-    return DEAD_BIT * sensor.dead.astype(np.uint32) + HOT_BIT * sensor.hot.astype(np.uint32)
 
 
 def _flipped(image: np.ndarray, flip: Flip) -> np.ndarray:

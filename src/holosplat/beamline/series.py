@@ -98,7 +98,11 @@ def read_series(
     snapshots = find_snapshots(paths, files.interval, files.time_unit)
     taken = np.array([snapshot.time - snapshots[0].time for snapshot in snapshots])
     times = timing.times(float(taken[-1]))
-    needed = _needed(taken, times[0] + timing.shutter.offsets[0], times[-1] + timing.shutter.offsets[-1])
+    slack = ROUNDING * taken[-1]
+    start = max(int(np.searchsorted(taken, (times[0] + timing.shutter.offsets[0]) + slack, side="right")) - 1, 0)
+    needed = slice(
+        start, int(np.searchsorted(taken, (times[-1] + timing.shutter.offsets[-1]) - slack, side="left")) + 1
+    )
     scenes = []
     for n, snapshot in enumerate(snapshots[needed]):
         scenes.append(filled_scene(snapshot.files, filling, energy_kev, files.length_unit))
@@ -115,10 +119,3 @@ def read_series(
 def held_out(split: np.ndarray, views: int, times: int, what: Literal["views", "times"]) -> np.ndarray:
     """[times · views] bool: `split` of the views, the same at all times, or of the times, all their views."""
     return np.tile(split, times) if what == "views" else np.repeat(split, views)
-
-
-def _needed(taken: np.ndarray, first: float, last: float) -> slice:
-    """The snapshots between which the times from `first` to `last` lie."""
-    slack = ROUNDING * taken[-1]
-    start = max(int(np.searchsorted(taken, first + slack, side="right")) - 1, 0)
-    return slice(start, int(np.searchsorted(taken, last - slack, side="left")) + 1)

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from ..fit.run import Run
 from ..geometry import Views
-from ..mesh import TriangleMesh
+from ..mesh import TriangleMesh, ball_radius
 from .shadows import Shadows
 
 ROUNDED = 3.0
@@ -69,7 +69,7 @@ class Explained:
     """
 
     def __init__(self, mesh: TriangleMesh, seen: Shadows, strain: float = STRAIN, run: Run | None = None) -> None:
-        radius = (3 * mesh.volume / (4 * np.pi)) ** (1 / 3)
+        radius = ball_radius(mesh.volume)
         self.mesh, self.seen, self.run = mesh, seen, run or Run()
         self.noise = max(seen.noise, MODEL_ERROR * radius)
         self.target, self.rest = torch.from_numpy(seen.thickness), torch.from_numpy(mesh.vertices)

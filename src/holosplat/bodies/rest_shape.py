@@ -14,7 +14,7 @@ from ..checks import InputError, at_least, in_range, require
 from ..geometry import Grid, Views
 from ..io.vtk import read_meshes
 from ..matter import Matter
-from ..mesh import TriangleMesh
+from ..mesh import TriangleMesh, ball_radius
 from ..ranges import Metres, Weight, checked_dataclass
 from ..representations import SurfaceMesh, isosurface
 from ..specimens.membrane.rest import FREQUENCIES, resting_cell
@@ -61,7 +61,7 @@ class KnownBody:
         """
         found = resting_cell() if self.shape == RED_CELL else self._read()
         factor = self.size / float(np.ptp(found.vertices, axis=0).max()) if self.size else 1.0
-        radius = factor * (3 * found.volume / (4 * np.pi)) ** (1 / 3) / pixel
+        radius = factor * ball_radius(found.volume) / pixel
         if not LEAST_PX <= radius <= MOST_PX:
             raise InputError(
                 f"a body of known shape must have a radius of {LEAST_PX:g} to {MOST_PX:g} pixels, but this one has "

@@ -10,7 +10,7 @@ import torch
 
 from ..fit.run import Run
 from ..matter import DeltaBeta
-from ..mesh import TriangleMesh
+from ..mesh import TriangleMesh, ball_radius
 from ..scan import Scan
 from .neighbourhood_search import Heard, pursued
 from .poses import FREER, Explained, Pose
@@ -37,7 +37,7 @@ class BodySearch:
     def of(cls, frames: Scan, material: DeltaBeta, body: KnownBody, ends: tuple[float, float]) -> BodySearch:
         """In `frames` of one pixel size and of some times between `ends` [s]. Errors: those of `KnownBody.mesh`."""
         coarse = body.mesh(frames.views.pixel_size, coarse=True)
-        radius = (3 * coarse.volume / (4 * np.pi)) ** (1 / 3)
+        radius = ball_radius(coarse.volume)
         factor = max(1, round(radius / SEARCH_RADIUS))
         return cls(body, Shadows.of(frames, material, *ends).binned(factor), factor, sized(coarse, 1 / factor))
 

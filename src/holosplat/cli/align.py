@@ -6,11 +6,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 from tyro.conf import Positional
 
 from ..checks import require
+from ..io.atomic import require_writable, write_rows
 from ..io.reading import Part, Reading
 from ..ranges import Small, checked_dataclass
+from ..scan import Exposures, Scan
 from .light import Degrees, LightFlags, Pixels, Share
 from .options import MaterialOptions, PriorOptions
 from .places import Output
@@ -18,11 +21,8 @@ from .progress import ProgressBar
 from .sentence import put, say, tell_frames
 
 if TYPE_CHECKING:
-    import numpy as np
-
-    from ..align import AlignedViews, Calibrated, PoseOptions, PosePrior
+    from ..align import AlignedViews, PoseOptions, PosePrior
     from ..mesh import TriangleMesh
-    from ..scan import Exposures
 
 
 TOML = ".toml"
@@ -81,8 +81,8 @@ class RefineOptions(MagnifiedFlags):
     """Beams that may be elsewhere than the scan says."""
 
     refine: str | None = None
-    """What is found of each frame beside the matter: shifts, angles, roll, distance, magnification, with commas between
-    (default: nothing, the beams are where the scan says)."""
+    """What is found of each frame beside the matter: shifts, angles, roll, distance, magnification, with commas
+    (default: none)."""
 
     def options(self) -> PoseOptions | None:
         """The options of the search; None where nothing is to be refined. Errors: `InputError` for other names."""
@@ -122,15 +122,11 @@ def align(
         table: Also write what was found of each view, with errors (CSV).
         geometry_out: Also write the geometry of all beams (TOML), which --exposures takes for other scans of them.
     """
-    import numpy as np
-
     from ..align import AlignedBeams, align_views, find_axis
-    from ..io.atomic import require_writable
     from ..io.formats import read_frames
     from ..io.larger_frames import heightened, of_parts
     from ..io.nxtomo import write_scan
     from ..planning.acts import of_alignment
-    from ..scan import Scan
 
     for path in (out, *([table] if table else []), *([geometry_out] if geometry_out else [])):
         require_writable(path)
@@ -177,8 +173,7 @@ def align(
 def _write_geometry(
     path: Path, source: Path, reading: Reading, moved: tuple[Exposures, Exposures], errors: np.ndarray | None, said: str
 ) -> None:
-    """That of whole frames: `moved` are the exposures before and after, of frames that may be cut and have larger
-    pixels; of a series, those of one time."""
+    """Write the geometry of whole frames; `moved`: exposures before and after, of cut or binned frames of one time."""
     from ..io.beams import Beams, write_beams
     from ..io.formats import read_as
 
@@ -200,8 +195,6 @@ def _write_geometry(
 
 def _write_table(path: Path, found: AlignedViews) -> None:
     """A row for each view."""
-    from ..io.atomic import write_rows
-
     names = (
         "shift_x_px",
         "shift_y_px",
@@ -270,7 +263,7 @@ def calibrate(
     """
     from ..align import CalibrationOptions
     from ..align import calibrate as find
-    from ..io.atomic import require_writable
+    from ..io.beams import Beams, write_beams
     from ..io.formats import read_frames
     from ..matter import MaterialPrior
 
@@ -284,13 +277,7 @@ def calibrate(
         options, light = CalibrationOptions(unknown.prior(), unknown.uncertain_pixel), illumination.options()
         found = find(measured, MaterialPrior.known(material), shape, options, light=light, on_progress=bar.show)
     put(found.lines())
-    _write_beams(out, scan, found)
-    say(f"wrote {out}: the geometry of {len(measured)} beams, for --exposures")
-
-
-def _write_beams(out: Path, scan: Path, found: Calibrated) -> None:
-    from ..io.beams import Beams, write_beams
-
     beams = Beams.of(found.exposures, found.errors, {"scan": str(scan), "calibrated": found.lines()[0]})
     size, doubt = found.pixel_size
     write_beams(out, beams.with_pixel_size(size) if doubt else beams)
+    say(f"wrote {out}: the geometry of {len(measured)} beams, for --exposures")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -10,25 +9,24 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from ..checks import InputError, require
+from ..io.atomic import is_taken
+from ..io.provenance import command_now
 from ..io.reading import Reading
-from ..ranges import Seed, Weight, checked_dataclass
+from ..ranges import Pixels, Seed, Weight, checked_dataclass
 from .align import AS_SAID, RefineOptions
 from .light import RunLightFlags
 from .options import BeamlineOptions, MethodOptions, PriorOptions
 from .places import Output
 from .progress import ProgressBar
-from .sentence import INTERRUPTED, interruptible, put, say, tell_frames, tell_reconstruction
+from .sentence import INTERRUPTED, interruptible, say, tell_frames, tell_reconstruction
 from .simulate import TruthOptions
 from .view import LiveFlags, watched
 
 if TYPE_CHECKING:
     from ..methods import Method
     from ..motion.flow_reconstruction import FlowOptions
-    from ..scan import Scan
     from ..series.plan import Settings
-    from ..workflows.evaluate import Evaluation
     from ..workflows.reconstruct import Reconstruction
-    from ..workflows.run_folder import RunFolder
 
 
 @checked_dataclass
@@ -36,11 +34,11 @@ class CarriedFlags:
     """How matter changes between the times of a scan."""
 
     motion: Literal["auto", "still", "each", "flow", "bodies"] | None = None
-    """still: one object for all times; each: a run for each time; flow: one object that a flow carries; bodies: closed
-    bodies on paths, as `track`; auto: by times set aside (default: one time)."""
+    """still: one object for all times; each: a run for each; flow: one object that a flow carries; bodies: closed
+    bodies, as `track`; auto: by times set aside (default: one time)."""
     fading: Weight = 0.0
-    """Standard deviation expected of what the logarithm of δ changes by over all times, where matter fades or grows
-    denser (0: it does not). About a third is a change by a third."""
+    """Expected standard deviation of the change of ln δ over all times, for matter that fades or grows denser (0:
+    none); 0.3 is a change by about a third."""
 
     def applied(self, reading: Reading) -> Reading:
         """`reading` of the times that --motion needs. Errors: `InputError` where --time-frame is given, too."""
@@ -59,13 +57,6 @@ class CarriedFlags:
 
         return FlowOptions(fading=self.fading)
 
-    def require_all(self, reading: Reading) -> None:
-        """`InputError` where something of it is asked of one time."""
-        require(
-            self.fading == 0 or reading.part.time_frame == "all",
-            "--fading is of matter that a flow carries; name --motion flow (auto may choose another), or leave it.",
-        )
-
 
 UNEXPLAINED = 3
 """Exit code of `reconstruct --strict` where frames are not explained."""
@@ -73,8 +64,7 @@ UNEXPLAINED = 3
 
 @dataclass(frozen=True)
 class Asked:
-    """What is asked of a reconstruction: what is known of the matter, how it is found, in which light, from where it
-    was seen, and what it may do in time."""
+    """What is asked of a reconstruction: what is known of the matter, method, light, geometry and motion."""
 
     matter: PriorOptions = field(default_factory=PriorOptions)
     how: MethodOptions = field(default_factory=MethodOptions)
@@ -92,15 +82,6 @@ class Asked:
         require(not ranges, f"--motion {named} needs one number for each constant; find it by reconstruct of one time.")
         shared = {"light": self.illumination.options(), "seed": seed}
         return Settings("reconstruct", method, self.how.kind_of_matter(), **shared)
-
-    def require_bodies(self, method: Method) -> None:
-        """`InputError` for what --motion bodies cannot be asked."""
-        from ..methods import Auto
-
-        stray = {"--refine": self.geometry.options() is not None}
-        stray |= {"--method": not isinstance(method, Auto), "--matter": self.how.kind_of_matter() is not None}
-        for name, given in stray.items():
-            require(not given, f"--motion bodies follows closed bodies through all times; leave {name}.")
 
     def ways(self, reading: Reading) -> dict[str, Any]:
         """What `workflows.reconstruct` takes by name; `InputError` for what does not go together."""
@@ -144,13 +125,17 @@ def reconstruct(
     from ..planning.scan_facts import can_be_seen
     from ..workflows.reconstruct import reconstruct as fit
     from ..workflows.run_folder import RunFolder, claimed
+    from .scans import scored, tell_found
     from .track import asks_for_motion, may_go_on, reconstruct_in_motion
 
     method, begun = asked.how.chosen(), asked.motion.applied(reading)
     by_time = asked.motion.motion in ("auto", "bodies") or begun.part.time_frame == "each"
     stray = by_time and (live.view or strict)
     require(not stray, "--view and --strict are of one time; leave them, or choose a time with --time-frame.")
-    asked.motion.require_all(begun)
+    require(
+        asked.motion.fading == 0 or begun.part.time_frame == "all",
+        "--fading is of matter that a flow carries; name --motion flow (auto may choose another), or leave it.",
+    )
     if asked.motion.motion == "auto":
         asked = _with_motion(scan, out, asked, reading, seed, resume)
     reading = asked.motion.applied(reading)
@@ -180,17 +165,14 @@ def reconstruct(
         with ProgressBar() as bar, watched(live, out.name, bar.show) as follow:
             told = {"on_progress": follow.on_progress, "on_state": follow.on_state}
             result = fit(measured, prior, method, seed, folder=folder, resume=resume, **ways, **told)
-        evaluation, report = _scored(folder, result, measured, scan, reading)
-    put(evaluation.lines())
-    _print_result(folder, result, report)
+        report = scored(folder, result, measured, scan, reading)
+    tell_found(folder, result, report)
     _end(result, out, strict)
 
 
 def _with_motion(scan: Path, out: Path, asked: Asked, reading: Reading, seed: int, resume: bool) -> Asked:
     """What is asked, with the motion that frames choose, or have chosen for what is begun in `out`."""
-    from ..io.atomic import is_taken
     from ..io.formats import read_frames
-    from ..io.provenance import command_now
     from ..workflows.motion_choice import MOTION, begun_motion, choose_motion, motion_of
 
     settings = asked.each_time(asked.how.chosen(), reading, seed)
@@ -213,39 +195,19 @@ def _with_motion(scan: Path, out: Path, asked: Asked, reading: Reading, seed: in
 
 def _time_by_time(scan: Path, out: Path, asked: Asked, reading: Reading, seed: int, resume: bool) -> None:
     """Bodies followed through all times, or a run for each time."""
+    from ..methods import Auto
     from .series import reconstruct_each
     from .track import track
 
     method = asked.how.chosen()
     if asked.motion.motion == "bodies":
-        asked.require_bodies(method)
+        stray = {"--refine": asked.geometry.options() is not None}
+        stray |= {"--method": not isinstance(method, Auto), "--matter": asked.how.kind_of_matter() is not None}
+        for name, given in stray.items():
+            require(not given, f"--motion bodies follows closed bodies through all times; leave {name}.")
         track(scan, out, asked.matter, seed=seed, resume=resume, reading=reading, illumination=asked.illumination)
     else:
         reconstruct_each(scan, out, asked.each_time(method, reading, seed), asked.matter.prior, reading, resume)
-
-
-def _scored(
-    folder: RunFolder, result: Reconstruction, measured: Scan, scan: Path, reading: Reading
-) -> tuple[Evaluation, Path]:
-    """The scores of a run on its frames, and its report; the folder then knows where its frames are."""
-    from ..io.formats import read_frames, run_source
-    from ..report.run import report_run
-    from ..workflows.evaluate import TIMES, write_times
-    from ..workflows.evaluate import evaluate as score
-    from ..workflows.reconstruction import instants_of
-    from .track import report_of_middle
-
-    found = reading.told.found({each.name: each.value for each in result.constants})
-    folder.write_source(run_source(scan, replace(reading, told=found)))
-    placed = result.placed(measured)
-    evaluation = score(result, placed, None)
-    if reading.part.time_frame in ("all", "still"):
-        every = replace(reading, told=reading.told.at_middle(), part=replace(reading.part, time_frame=None))
-        each = result.placed(read_frames(scan, every)).in_memory()
-        write_times(folder.path / TIMES, result, each, evaluation.light)
-    if instants_of(folder):
-        return evaluation, report_of_middle(folder, result, placed)
-    return evaluation, report_run(folder, result, placed, evaluation, None)
 
 
 def _end(result: Reconstruction, out: Path, strict: bool) -> None:
@@ -258,23 +220,6 @@ def _end(result: Reconstruction, out: Path, strict: bool) -> None:
         raise SystemExit(INTERRUPTED)
     if strict and unexplained:
         raise SystemExit(UNEXPLAINED)
-
-
-def _print_result(folder: RunFolder, result: Reconstruction, report: Path) -> None:
-    """What was found and decided, and whether it explains the frames."""
-    from ..io.atomic import read_json
-    from ..workflows.evaluate import TIMES, lines_of_times
-
-    if folder.light.is_file():
-        say(f"light: {read_json(folder.summary)['light']} ({folder.light})")
-    put(constant.line() for constant in result.constants)
-    put(result.geometry.lines() if result.geometry else ())
-    put(result.choice.lines())
-    say(f"{sum(result.timing.values()):.1f} s, {result.object.described}; report: {report}")
-    put((*(result.verdict.lines("training frames") if result.verdict else ()), *lines_of_times(folder.path / TIMES)))
-    if result.total:
-        print(result.total.words)
-    say(f"not rehearsed: for intervals of these numbers, and a verdict beside them: holosplat rehearse {folder.path}")
 
 
 def render(
@@ -292,20 +237,9 @@ def render(
         out: Scan file to write: the predicted frames, in the scan's order.
         split: Which frames.
     """
-    from ..io.atomic import require_writable
-    from ..io.nxtomo import write_scan
-    from ..scan import Scan
-    from ..workflows.evaluate import render as predict
-    from ..workflows.run_folder import RunFolder
-    from .scans import run_and_scan
+    from .scans import predict
 
-    require_writable(out)
-    result, wanted = run_and_scan(RunFolder(run), scan, reading)
-    chosen = {"test": wanted.test, "train": wanted.train, "all": lambda: wanted}[split]()
-    require(len(chosen) > 0, f"{scan} has no {split} frames to render; choose another --split.")
-    frames = predict(result, chosen.exposures)
-    write_scan(out, Scan(frames, chosen.exposures, chosen.is_test, {"rendered_from": run.name}))
-    say(f"wrote {out}: {len(frames)} predicted frames")
+    predict(run, scan, out, split, reading)
 
 
 def evaluate(
@@ -325,34 +259,61 @@ def evaluate(
         truth: Volume file of the truth, of any format that export --volume writes.
         as_json: Print JSON instead of a table.
     """
-    from ..io.formats import read_volume_file
-    from ..report.run import report_run
-    from ..workflows.evaluate import evaluate as score
-    from ..workflows.evaluate import require_overlap, require_same_field
-    from ..workflows.provenance import scan_hash
-    from ..workflows.reconstruction import instants_of
-    from ..workflows.run_folder import RunFolder, claimed
-    from .scans import run_and_scan
+    from .scans import judge
 
-    folder = RunFolder(run)
-    result, measured = run_and_scan(folder, scan, reading)
-    true_volume = read_volume_file(truth, result.delta_told) if truth else None
-    if truth is not None and true_volume is not None:
-        require_same_field(true_volume.grid, measured.views, truth)
-    evaluation = score(result, measured, true_volume)
-    if truth is not None and evaluation.volume is not None:
-        require_overlap(evaluation.volume, truth)
-    if as_json:
-        print(json.dumps(evaluation.as_dict(), indent=2, allow_nan=False))
-    else:
-        put(evaluation.lines())
-    if instants_of(folder):
-        return  # its report is of the time in the middle
-    if not folder.is_of(scan_hash(measured)):
-        say("this is not the scan that was reconstructed, its frames may have been fitted; report unchanged")
-    elif true_volume is not None or not folder.report.exists():
-        with claimed(folder):
-            say(f"report: {report_run(folder, result, measured, evaluation, true_volume)}")
+    judge(run, scan, truth, as_json, reading)
+
+
+@checked_dataclass
+class ObjectFiles:
+    """The object of a run as it is, not its volume."""
+
+    compact: Output | None = None
+    """File several times smaller than the run's, of rounded numbers (HDF5); of a run of track, of all times."""
+    step_px: Pixels = 1 / 32
+    """Step of places in it [pixels]; those of sizes, orientations and amplitudes go with it."""
+    together: tuple[Path, ...] = ()
+    """More runs of a series, in order, for the same file of --compact, which stores once what they have in common."""
+    splats: Output | None = None
+    """PLY file of splat viewers (µm), of a run of Gaussians; their opacity is no phase (docs/export.md)."""
+
+
+def export(
+    run: Positional[Path],
+    volume: Output | None = None,
+    shape: tuple[int, int, int] | None = None,
+    voxel_size: float | None = None,
+    bodies: Output | None = None,
+    time_frame: int | Literal["all"] | None = None,
+    objects: ObjectFiles = ObjectFiles(),
+) -> None:
+    """Write δ and β of a run as a volume, its bodies as meshes, or its object in few bytes or as splats.
+
+    Args:
+        run: Run folder, or the folder of a series of single times.
+        volume: Volume to write, by its suffix: .h5 or .hdf5, HDF5; .vti, for ParaView and PyVista; .nrrd, for 3D Slicer
+            and ITK; .mrc, for ChimeraX; .tif or .tiff, an OME-TIFF; .zarr, a folder of OME-Zarr (extra zarr). NRRD and
+            MRC hold δ alone, and β in NAME.beta.nrrd or NAME.beta.mrc. Of absorption alone µ [1/m] stands in δ's place.
+            HDF5 also holds /views, the number of training views that show each voxel, if the run's scan is there; and
+            of a rehearsed run /matter, the probability that a voxel is matter.
+        shape: Voxels along z, y, x (default: the scan's field of view, Z = X = W, Y = H).
+        voxel_size: Edge of a voxel [m] (default: the pixel size).
+        bodies: Of a run of surfaces: a folder to make, with one VTK file a body (µm), the largest first, or of a run
+            of track the same body under the same name at all times; or by its suffix one file of all bodies, .vtu
+            (VTK, µm), .stl (µm) or .glb (glTF, m).
+        time_frame: Of a series, and of a run of track: the time, counted from 0 (default: the first), or all, to files
+            and folders whose names end with _t0000 and so on, or of track to one .glb in which the bodies move. Beside
+            HDF5 a .xdmf, beside .vti and .vtu a .pvd opens all times in ParaView.
+    """
+    from .export import write_files
+
+    require(
+        any((volume, bodies, objects.compact, objects.splats)),
+        "export needs --volume, --bodies, --compact or --splats; name what to write.",
+    )
+    require(objects.compact is not None or not objects.together, "--together needs --compact; name its file.")
+    files = {"volume": volume, "bodies": bodies, "compact": objects.compact, "splats": objects.splats}
+    write_files(run, files, (shape, voxel_size), time_frame, objects.step_px, objects.together)
 
 
 def demo(out: Output = Path("demo")) -> None:
@@ -380,21 +341,15 @@ def demo(out: Output = Path("demo")) -> None:
 
 def backends() -> None:
     """Say which backends can be used here, and what each of them offers."""
-    from ..backends import DESCRIPTIONS, device_name, missing, support_table
+    from ..backends import DESCRIPTIONS, device_name, missing, resolve, support_table
 
     for name, description in DESCRIPTIONS.items():
         reason = missing(name)
         state = f"not usable here: {reason}" if reason else f"usable ({device_name(name)})"
         print(f"{name:10} {description}; {state}")
-    print(f"auto       {_auto()}\n")
+    try:
+        print(f"auto       would take {resolve('auto')}\n")
+    except InputError:
+        print("auto       finds neither cpu nor cuda\n")
     for operation, *kinds in [["", *DESCRIPTIONS], *support_table()]:
         print(f"{operation:36}" + "".join(f"{kind:22}" for kind in kinds).rstrip())
-
-
-def _auto() -> str:
-    from ..backends import resolve
-
-    try:
-        return f"would take {resolve('auto')}"
-    except InputError:
-        return "finds neither cpu nor cuda"

@@ -1,19 +1,20 @@
-"""`holosplat convert | retrieve`: scans from and to the formats that others read; phase and thickness of single
-frames."""
+"""`holosplat convert | retrieve`: scans in other formats; phase and thickness of single frames."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
 from tyro.conf import Positional, arg
 
+from ..baselines.retrieve import Retrieved
+from ..baselines.retrieve import retrieve as act
 from ..checks import InputError, require
 from ..io.atomic import atomic_path
-from ..io.formats import HDF5_SUFFIXES, ScanFormat, loader_of, read_as, read_volume_file
+from ..io.formats import HDF5_SUFFIXES, ScanFormat, loader_of, read_as, read_frames, read_volume_file
 from ..io.images import TiffLayout, write_tiff
 from ..io.nerf_synthetic import NerfOptions, PngKind, grey_range, write_nerf_synthetic
 from ..io.nxtomo import write_scan
@@ -23,17 +24,14 @@ from ..io.reading import Reading
 from ..matter import DeltaBeta, KnownRatio, MaterialPrior
 from ..methods.method import STAND_IN_RATIO, shows_no_refraction
 from ..optics import retrieve_thickness
-from ..ranges import Grams, Metres, Natural, Positive, Signed, checked_dataclass
+from ..ranges import Metres, Natural, Positive, Signed, checked_dataclass, flag
 from ..scan import Scan
 from ..workflows.run_illumination import FixedPatternOptions, flatfield_corrected
 from .light import LightFlags
-from .options import PriorOptions
+from .options import OneMaterial, PriorOptions
 from .places import Output
 from .progress import ProgressBar
 from .sentence import say
-
-if TYPE_CHECKING:
-    from ..baselines.retrieve import Retrieved
 
 
 @checked_dataclass
@@ -51,21 +49,14 @@ class WritingOptions:
     seed_points: Natural | None = None
     """nerf-synthetic, r2-gaussian: points to start from."""
 
-    def for_format(self, to: ScanFormat) -> dict[str, Any]:
-        """Those that are said; `InputError` for one that `to` does not know."""
-        said = {name: value for name, value in vars(self).items() if value is not None}
-        for name in said:
-            require(to in GOES_WITH[name], f"--{name.replace('_', '-')} goes with --to {' or '.join(GOES_WITH[name])}.")
-        return said
-
 
 @checked_dataclass
 class EveningOptions:
     """Light that is the same in all frames."""
 
     still_light: int | None = None
-    """Divide out what all frames for training have in common beside the matter that they show: light of up to so many
-    half waves across a frame, such as 4, or any pattern (0) (default: nothing)."""
+    """Divide out the light that all training frames share: up to so many half waves across a frame, such as 4, or any
+    pattern (0) (default: nothing)."""
     inside: Metres | None = None
     """With it: distance from the axis within which matter lies [m] (default: anywhere)."""
 
@@ -119,11 +110,16 @@ def convert(
         named = out.suffix.lower() in (NXTOMO, *HDF5_SUFFIXES)
         require(named, f"--to is required, for {out.name} says no format by its suffix ({NXTOMO} is nxtomo); add it.")
         to = "nxtomo"
-    said = writing.for_format(to)
+    said = {name: value for name, value in vars(writing).items() if value is not None}
+    for name in said:
+        require(to in GOES_WITH[name], f"{flag(name)} goes with --to {' or '.join(GOES_WITH[name])}.")
     require(
         reading.told.wall is None, "--wall is part of models and changes no frames; give it to reconstruct instead."
     )
-    scan = _read(source, reading)
+    scan = read_as(source, reading, joined=False)
+    if loader_of(source).name == "r2-gaussian":
+        say(f"{source} has no phase: transmission exp(-p) in contact, where a density of 1 has beta "
+             f"{scan.provenance['beta_of_density_1']}; reconstruct it with --delta-beta 1, and read beta")  # fmt: skip
     prior = matter.prior(scan.exposures.reference_energy)
     wanted = evening.still_light is not None or to in GOES_WITH["material"]
     require(not prior.fixes_ratio or wanted, f"a material is not needed with --to {to}; leave it.")
@@ -137,31 +133,21 @@ def convert(
     elif to == "nerf-synthetic":
         thickness = _retrieved(scan, prior)[0] if prior.fixes_ratio else None
         write_nerf_synthetic(out, scan, replace(NerfOptions(), **said), thickness)
-        _say_what_is_cut(scan)
+        (low, high), held_out = grey_range(scan), scan.frames[scan.is_test]
+        if cut := int(((held_out < low) | (held_out > high)).sum()):
+            say(f"{cut} of {held_out.size} held-out pixels lie beyond the training frames' range and were cut off")
     else:
         require(prior.fixes_ratio, "--to r2-gaussian needs --material or --delta-beta: it takes retrieved thickness.")
         if writing.truth:
             said["truth"] = read_volume_file(writing.truth)
         write_r2_gaussian(out, scan, *_retrieved(scan, prior), replace(R2Options(), **said))
-    held_out = int(scan.is_test.sum())
     say(f"wrote {out}: {to}, {len(scan)} frames of {scan.views.shape[0]} × {scan.views.shape[1]} pixels, "
-         f"{held_out} of them held out")  # fmt: skip
-
-
-def _read(source: Path, reading: Reading) -> Scan:
-    """The scan at `source`, which may be a folder of another program."""
-    scan = read_as(source, reading, joined=False)
-    if loader_of(source).name == "r2-gaussian":
-        say(f"{source} has no phase: transmission exp(-p) in contact, where a density of 1 has beta "
-             f"{scan.provenance['beta_of_density_1']}; reconstruct it with --delta-beta 1, and read beta")  # fmt: skip
-    return scan
+         f"{int(scan.is_test.sum())} of them held out")  # fmt: skip
 
 
 def _retrieved(scan: Scan, prior: MaterialPrior) -> tuple[np.ndarray, float]:
-    """Thickness [N, H, W] [m] of a material, by Paganin (2002), and the material's δ.
-
-    Where only δ/β is known, δ is such that the greatest thickness is half the field's longer side.
-    """
+    """Thickness [N, H, W] [m] of a material, by Paganin (2002), and its δ; of δ/β alone such that the greatest
+    thickness is half the field's longer side."""
     exposures, views = scan.exposures.optical, scan.views
     delta, beta = (1.0, 1.0 / prior.ratio) if isinstance(prior, KnownRatio) else prior.materials[0]
     refraction = exposures.refraction(delta, beta)
@@ -176,14 +162,6 @@ def _retrieved(scan: Scan, prior: MaterialPrior) -> tuple[np.ndarray, float]:
     return found / scale, scale
 
 
-def _say_what_is_cut(scan: Scan) -> None:
-    low, high = grey_range(scan)
-    held_out = scan.frames[scan.is_test]
-    cut = int(((held_out < low) | (held_out > high)).sum())
-    if cut:
-        say(f"{cut} of {held_out.size} held-out pixels lie beyond the training frames' range and were cut off to it")
-
-
 STAND_IN_DELTA = 1e-6
 """δ where only δ/β is known: the phase does not depend on it."""
 
@@ -192,17 +170,9 @@ RetrievalName = Literal["tikhonov", "admm", "ctf", "paganin", "gerchberg-saxton"
 
 
 @checked_dataclass
-class OneMaterial:
+class RatioOptions(OneMaterial):
     """The one material; give it, or δ/β."""
 
-    material: str | None = None
-    """Formula or name of the material (holosplat materials lists them)."""
-    density: Grams | None = None
-    """Its density [g/cm³]; a named one has its own."""
-    medium: str | None = None
-    """Formula or name of what surrounds it; none means vacuum."""
-    medium_density: Grams | None = None
-    """The medium's density [g/cm³]."""
     delta_beta: Signed | None = None
     """Or: only the ratio δ/β is known; it gives the phase, and no thickness."""
     contrast: Literal["above", "below"] = "above"
@@ -224,7 +194,7 @@ class OneMaterial:
 def retrieve(
     scan: Positional[Path],
     out: Output,
-    matter: OneMaterial = OneMaterial(),
+    matter: RatioOptions = RatioOptions(),
     method: RetrievalName = "tikhonov",
     illumination: LightFlags = LightFlags(),
     reading: Reading = Reading(),
@@ -236,9 +206,6 @@ def retrieve(
         out: HDF5 file to write (.h5), or folder to make: a TIFF stack a map, maps.json and a preview.
         method: Tikhonov through the full wave optics is the most reliable; docs/phase_retrieval.md compares them.
     """
-    from ..baselines.retrieve import retrieve as act
-    from ..io.formats import read_frames
-
     measured = read_frames(scan, reading).in_memory()
     material, level = matter.at(measured.exposures.reference_energy)
     with ProgressBar() as bar:
@@ -255,7 +222,12 @@ def retrieve(
     write_phase_maps(out, PhaseMaps(maps, measured.exposures, facts))
     if not is_file(out):
         _preview(out / "preview.png", measured, found)
-    _report(out, measured, found, level)
+    what = "phase (rad) and thickness (m)" if level else "phase (rad); without --material there is no thickness"
+    low, high = (float(np.quantile(found.phase.numpy(), share)) for share in (1e-4, 1 - 1e-4))
+    print(f"phase from {low:.4g} to {high + 0.0:.4g} rad (quantiles 1e-4 and 1 - 1e-4); light {words}")
+    if not measured.exposures.distance.any():
+        say("the frames are in contact: they show absorption, and the phase is what δ/β makes of it")
+    say(f"wrote {out}: {what}, {len(measured)} frames")
 
 
 def _preview(path: Path, measured: Scan, found: Retrieved) -> None:
@@ -272,12 +244,3 @@ def _preview(path: Path, measured: Scan, found: Retrieved) -> None:
     )
     with atomic_path(path) as temporary:
         figure.savefig(temporary)
-
-
-def _report(out: Path, measured: Scan, found: Retrieved, level: bool) -> None:
-    what = "phase (rad) and thickness (m)" if level else "phase (rad); without --material there is no thickness"
-    low, high = (float(np.quantile(found.phase.numpy(), share)) for share in (1e-4, 1 - 1e-4))
-    print(f"phase from {low:.4g} to {high + 0.0:.4g} rad (quantiles 1e-4 and 1 - 1e-4); light {found.light.in_words}")
-    if not measured.exposures.distance.any():
-        say("the frames are in contact: they show absorption, and the phase is what δ/β makes of it")
-    say(f"wrote {out}: {what}, {len(measured)} frames")

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg, subcommand
 
-from ..checks import InputError
+from ..checks import InputError, require
 from ..io.reading import Reading
 from ..workflows.run_folder import check as look
 from .places import Output, with_checked_arguments
@@ -61,7 +61,6 @@ def materials(names: Positional[tuple[str, ...]] = (), energy_kev: float = 20.0)
         names: Only those whose name has one of these texts in it (default: all).
         energy_kev: Photon energy [keV].
     """
-    from ..checks import require
     from ..materials import named_materials
 
     wanted = [text.lower() for text in names]

@@ -168,7 +168,9 @@ def forecast(
     tracked_bodies(tracked)
     times = np.array(instants_of(folder))
     require_cells(tracked, times, options)
-    scan = _whole_scan(folder)
+    own = run_reading(folder.path)  # of all times of the scan, later ones too, where the run found the geometry to be
+    reading = replace(own, part=replace(own.part, time_frame=None, time_frames=None))
+    scan = where_found(folder, read_frames(folder.source_scan(), reading).in_memory())
     known = scan.exposures[scan.exposures.time <= times[-1]]
     tell("the forecast", of_forecast(known, MotionFit().schedule.views_per_step), out)
     config = config_of(options, scan, folder.read_config(), seed)
@@ -186,13 +188,6 @@ def forecast(
         final = reconstruction_at(done, found.forecast.times.tolist(), last)
         say(f"report: {report_run(new, final, shown, evaluate(final, shown, None), None)}")
     say(f"wrote {out / COLLECTION}, {out / TRACKS}, {out / FRAMES}, {out / TABLE}")
-
-
-def _whole_scan(folder: RunFolder) -> Scan:
-    """The scan of a run of track, of all its times, later ones too, where the run found the geometry to be."""
-    own = run_reading(folder.path)
-    reading = replace(own, part=replace(own.part, time_frame=None, time_frames=None))
-    return where_found(folder, read_frames(folder.source_scan(), reading).in_memory())
 
 
 def _source(folder: RunFolder, scan: Scan, found: Forecasted, out: Path) -> dict[str, object]:

@@ -93,7 +93,7 @@ UNSAID = ("None", "False", "True", "")
 @dataclass(frozen=True)
 class Option:
     """An option of a command: its name, such as `pixel_size`, how it is called, what it is, its default as the parser
-    shows it (empty where there is none), the heading above it, whether it is required, and the parser's action."""
+    shows it (empty: none), the heading above it, whether it is required, and the parser's action."""
 
     name: str
     called: str
@@ -102,6 +102,16 @@ class Option:
     heading: str
     required: bool
     action: Action
+
+    @property
+    def key(self) -> str:
+        """What it is called in a pipeline file, and behind -- on the command line."""
+        return self.name.replace("_", "-")
+
+    @property
+    def is_bare(self) -> bool:
+        """Whether it has no flag."""
+        return not self.action.option_strings
 
     @property
     def is_switch(self) -> bool:
@@ -116,7 +126,7 @@ class Option:
     def lines(self, width: int) -> Iterator[str]:
         """The option and its text, in `width` columns."""
         said = self.text
-        if self.required and self.action.option_strings:
+        if self.required and not self.is_bare:
             said += " (required)"
         elif self.default not in UNSAID and "(default:" not in said:
             said += f" (default: {self.default})"
@@ -170,7 +180,7 @@ def _option(action: Action, heading: str) -> Option:
 def is_essential(name: str, option: Option) -> bool:
     """Whether `--help` of the command `name` shows an option."""
     chosen = ESSENTIAL.get(name)
-    return chosen is None or option.required or not option.action.option_strings or option.name in (*chosen, "force")
+    return chosen is None or option.required or option.is_bare or option.name in (*chosen, "force")
 
 
 def page(name: str, parser: ArgumentParser, everything: bool) -> str:
@@ -178,8 +188,8 @@ def page(name: str, parser: ArgumentParser, everything: bool) -> str:
     width = min(shutil.get_terminal_size().columns, WIDEST)
     options, acts = options_of(parser), acts_of(parser)
     shown = [one for one in options if everything or is_essential(name, one)]
-    usage = " ".join(one.called if one.action.nargs != "?" else f"[{one.called}]" for one in options if _is_bare(one))
-    required = " ".join(one.called for one in options if one.required and not _is_bare(one))
+    usage = " ".join(one.called if one.action.nargs != "?" else f"[{one.called}]" for one in options if one.is_bare)
+    required = " ".join(one.called for one in options if one.required and not one.is_bare)
     words = f"usage: holosplat {name} {'{' + ','.join(acts) + '}' if acts else ''}{usage} {required} [OPTIONS]"
     lines = wrap(" ".join(words.split()), width, subsequent_indent="    ")
     for paragraph in (parser.description or "").split("\n\n"):
@@ -211,8 +221,3 @@ def overview(groups: Mapping[str, Sequence[tuple[str, str]]], description: str) 
 
 def _row(name: str, text: str, width: int) -> list[str]:
     return wrap(text, width, initial_indent=f"  {name:12}", subsequent_indent=" " * 14)
-
-
-def _is_bare(option: Option) -> bool:
-    """Whether an option has no flag."""
-    return not option.action.option_strings

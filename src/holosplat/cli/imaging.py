@@ -1,24 +1,32 @@
-"""`holosplat record | correct | join`: camera and pulses, flat fields, and beams brought together."""
+"""`holosplat grow | record | correct | join`: cells in the flow through a channel, camera and pulses, flat fields, and
+beams brought together."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from tyro.conf import Positional
 
+from ..beamline.grow import Growth, SeriesFolder
+from ..beamline.grow import grow as grow_cells
 from ..beamline.record import RecordingOptions
 from ..beamline.record import record as record_file
+from ..io.lock import sole_writer
 from ..io.reading import Part, Reading
 from ..optics.camera import Camera, Illumination
 from ..optics.resampling import Flip
-from ..units import span
+from ..planning.acts import of_growth
+from ..planning.needs import Needs
+from ..specimens.membrane.rest import nodes_of
+from ..units import in_percent, span
 from ..workflows.correct import FAR, Corrected, CorrectionOptions
 from ..workflows.correct import correct as correct_file
 from ..workflows.join import join as join_files
 from .places import Output
 from .progress import ProgressBar
-from .sentence import say
+from .sentence import interruptible, say, tell
 
 OFF = 0.02
 """How far air may be off 1 before it is warned of."""
@@ -115,3 +123,32 @@ def join(
         joined = join_files(scans, out, pixel_size, flip, bar.of("joining frames"), part, exposures)
     rows, columns = joined.views.shape
     say(f"wrote {out}: {len(joined)} frames of {rows} × {columns} pixels of {span(1e6 * joined.views.pixel_sizes)} µm")
+
+
+def grow(out: Output, what: Growth, resume: bool = False) -> None:
+    """Let red cells flow through a channel, and write their meshes (VTK, µm) at every snapshot.
+
+    Args:
+        out: Folder to make: rbcCC_TTT.vtp for cell CC at snapshot TTT, and cells.pvd, which ParaView opens.
+        resume: Go on with an interrupted run, or to more snapshots; --resume FOLDER alone, with its options.
+    """
+    what.check()
+    coarser = ((f"--frequency {f}", _needs(replace(what, frequency=f))) for f in range(what.frequency - 1, 2, -1))
+    tell("grow", _needs(what), out, coarser)
+    with interruptible(lambda: _cut_off(SeriesFolder(out))), sole_writer(out), ProgressBar() as bar:
+        grown = grow_cells(what, out, resume, bar.of("cells in flow"))
+    wrote = out if what.compact else SeriesFolder(out).collection
+    say(
+        f"wrote {wrote}: {grown.snapshots} snapshots of {what.cells} cells, "
+        f"{what.period:.4g} s apart; {grown.state.taken} steps, {grown.state.refused} refused; "
+        f"volume within {in_percent(grown.volume)}, area within {in_percent(grown.area)}"
+    )
+
+
+def _cut_off(folder: SeriesFolder) -> str:
+    kept = "snapshots so far stay in" if folder.state.is_file() else "no snapshot yet in"
+    return f"interrupted; {kept} {folder.path}; go on with --resume"
+
+
+def _needs(what: Growth) -> Needs:
+    return of_growth(what.cells, nodes_of(what.frequency), what.snapshots, what.flow * what.period)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -14,8 +15,6 @@ from .progress import ProgressBar
 from .sentence import interruptible, tell
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from ..planning.needs import Needs
     from ..training.train import Training
 

@@ -46,8 +46,8 @@ class RunLightFlags(LightFlags):
     """The light beside the flat fields, of several frames."""
 
     still_light: Literal["auto", "none"] = "auto"
-    """auto: a pattern that all frames have in common in the same pixels is divided out, where unseen frames are then
-    predicted better; none: it is not."""
+    """auto: divide out a pattern that all frames have in the same pixels, if unseen frames are then predicted better;
+    none: keep it."""
     decide: tuple[str, ...] = ()
     """Decisions that are told, as NAME=CHOICE: light=even or smooth, pattern=none, noise=white or correlated."""
 

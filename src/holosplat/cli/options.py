@@ -6,11 +6,12 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
+import numpy as np
 from tyro.conf import UseAppendAction, arg
 
-from ..beamline.light import UnevenLight
 from ..beamline.misalignment import Directions
 from ..checks import InputError, require
+from ..geometry import Views
 from ..io.reading import ends_of, told_energy
 from ..ranges import (
     Angle,
@@ -32,16 +33,13 @@ from ..ranges import (
     checked_dataclass,
     ranged,
 )
+from ..scan import Exposures, interleaved_split
 
 if TYPE_CHECKING:
-    import numpy as np
-
-    from ..beamline.misalignment import Misalignment
-    from ..beamline.series import SeriesFiles, Timing
-    from ..beamline.simulate import Filling, Shutter, Simulation
+    from ..beamline.series import Timing
+    from ..beamline.simulate import Filling, Shutter
     from ..matter import MaterialPrior, MatterKind
     from ..methods import Method
-    from ..scan import Exposures
 
 
 @checked_dataclass
@@ -59,12 +57,6 @@ class MeshOptions:
     period: tuple[Weight, Weight, Weight] | None = None
     """Series: edges x, y, z of the periodic box that bodies were folded into, in the files' coordinates; 0: none."""
 
-    def series(self) -> SeriesFiles:
-        """How the files of a series are read."""
-        from ..beamline.series import SeriesFiles
-
-        return SeriesFiles(self.length_unit, self.origin, self.snapshot_interval, self.time_unit, self.period)
-
     def require_static(self) -> None:
         """`InputError` if something is given that only a series has."""
         stray = [name for name in ("snapshot_interval", "time_unit", "period") if getattr(self, name) is not None]
@@ -72,21 +64,27 @@ class MeshOptions:
 
 
 @checked_dataclass
-class MaterialOptions:
-    """What fills the meshes."""
+class OneMaterial:
+    """One material, and what surrounds it."""
 
     material: str | None = None
-    """Formula, or a name (holosplat materials lists them); without --materials, haemoglobin."""
+    """Formula, or a name (holosplat materials lists them)."""
     density: Grams | None = None
     """Its density [g/cm³]; a named one has its own."""
     medium: str | None = None
-    """Formula or name of what surrounds the meshes; none means vacuum."""
+    """Formula or name of what surrounds it; none means vacuum."""
     medium_density: Grams | None = None
     """The medium's density [g/cm³]."""
+
+
+@checked_dataclass
+class MaterialOptions(OneMaterial):
+    """What fills the meshes."""
+
     index: Index | None = None
     """Or, of light: their refractive index, of matter that does not absorb, in a medium of --medium-index."""
     materials: Path | None = None
-    """JSON or TOML table of materials by mesh file name, for scenes of several."""
+    """JSON or TOML table of materials by mesh file name, for scenes of several (default: haemoglobin in all)."""
 
     def filling(self, medium_index: float | None = None) -> Filling:
         """The materials that the options name, in a medium of so large a refractive index for light."""
@@ -138,8 +136,7 @@ class BeamlineOptions(Directions):
     """One view in so many is held out of the fit (0: none)."""
 
     def told(self) -> BeamlineOptions:
-        """The same with one photon energy, and what the file of --exposures says; `InputError` for options that say it
-        twice."""
+        """The same with one photon energy and what --exposures says; `InputError` for options that say it twice."""
         once = not self.distances or (self.distance == BeamlineOptions.distance and self.exposures is None)
         require(once, "--distances says how far the detector is; leave --distance, or --exposures.")
         told = None if self.energy_kev == BeamlineOptions.energy_kev else self.energy_kev
@@ -157,12 +154,7 @@ class BeamlineOptions(Directions):
 
     def planned(self) -> Exposures:
         """How each frame is taken."""
-        from ..scan import Exposures
-
         if self.exposures is not None:
-            import numpy as np
-
-            from ..geometry import Views
             from ..io.beams import read_beams
 
             others = (getattr(self, one.name) != one.default for one in fields(Directions))
@@ -180,8 +172,6 @@ class BeamlineOptions(Directions):
 
     def split(self, count: int) -> np.ndarray:
         """[count] bool: the frames that are held out; of several distances, all frames of a pose, or none."""
-        from ..scan import interleaved_split
-
         if self.distances:
             poses = replace(self, distances=()).split(count // len(self.distances))
             return poses[[n % len(poses) for n in range(count)]]
@@ -199,12 +189,6 @@ class NoiseOptions:
     """Mean photons a pixel for Poisson noise; none means noise-free."""
     seed: Seed = 0
     """Seed of the noise."""
-
-    def simulation(self, shutter: Shutter, light: UnevenLight) -> Simulation:
-        """How frames are simulated."""
-        from ..beamline.simulate import Simulation
-
-        return Simulation(self.photons_per_pixel, self.seed, shutter=shutter, light=light)
 
 
 @checked_dataclass
@@ -256,17 +240,6 @@ class MisalignmentOptions:
     misalign_seed: Seed = 0
     """Seed of these errors."""
 
-    def errors(self) -> Misalignment:
-        """The errors that the options name."""
-        from ..beamline.misalignment import Misalignment
-
-        errors = (self.misalign_shift, self.misalign_rotation, self.misalign_distance)
-        return Misalignment(*errors, self.misalign_seed, self.misalign_magnification)
-
-    def facts(self) -> dict[str, str]:
-        """What the file of the true exposures says of them."""
-        return {name: f"{value:g}" for name, value in vars(self).items()}
-
 
 @checked_dataclass
 class MethodOptions:
@@ -285,8 +258,8 @@ class MethodOptions:
     changes: Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="PATH=VALUE")] = ()
     """Change one option, such as fit.schedule.steps=500 or fit.steps=500; may be given again and again."""
     start: Literal["phase", "learned", "random"] | None = None
-    """What Gaussians begin with: phase retrieval and tomography; what a trained network guesses, where that explains
-    the frames clearly better; or nothing (default: as the options say, phase)."""
+    """Start of Gaussians: phase retrieval with tomography; a trained network, where that explains the frames clearly
+    better; or random (default: as the options say, phase)."""
     backend: Literal["auto", "cpu", "cuda", "reference"] | None = None
     """What computes the fit (default: as the options say, auto); `holosplat backends` lists what there is."""
 
@@ -332,8 +305,8 @@ class PriorOptions:
     delta_beta: Signed | str | None = None
     """Or: only the ratio δ/β of the one material is known, or a range LOW:HIGH of it (for `reconstruct`)."""
     contrast: Literal["auto", "above", "below", "both"] = "auto"
-    """Side of the medium's δ on which matter lies: above, below, or both, of continuous matter such as a shock; auto:
-    by the material, or the frames decide."""
+    """Side of the medium's δ on which matter lies; both: continuous matter such as a shock; auto: by material or
+    frames."""
 
     def ranges(self) -> dict[str, tuple[float, float]]:
         """What is said as a range, by name."""
@@ -345,8 +318,8 @@ class PriorOptions:
         return replace(self, delta_beta=None) if self.ranges() else self
 
     def prior(self, energy_kev: float, wall: str | None = None) -> MaterialPrior:
-        """The prior at `energy_kev` [keV], of what a `wall` encloses. Errors: `InputError` for a range of δ/β, and for
-        a medium that is not the filling of the wall."""
+        """The prior at `energy_kev` [keV] in a `wall`; `InputError` for a range of δ/β, and a medium that is not the
+        filling."""
         from ..materials import require_in_wall
         from ..matter import MaterialPrior
 

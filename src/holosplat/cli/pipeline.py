@@ -21,10 +21,9 @@ from ..io.lock import writer_of
 from ..io.provenance import is_hdf5
 from ..ranges import checked_later, with_checked_numbers
 from ..tables import read_table, shown
-from .entry import command
+from .entry import OF_ONE_CALL, command, is_made_by
 from .help import CONFIG, Option, is_essential, options_of, parser_of, wrap
 from .places import Place, is_run, of_times, places_of, require_apart
-from .resume import OF_ONE_CALL, is_made_by
 from .sentence import say
 
 STAGES = ("correct", "align", "reconstruct", "export")
@@ -44,8 +43,7 @@ HEAD = """\
 
 @dataclass(frozen=True)
 class Stage:
-    """A stage whose options are checked: the command's name, its function, its words as typed on a command line, and
-    what the parser makes of these."""
+    """A stage with checked options: its command, the function, the words of a command line, and their values."""
 
     name: str
     function: Callable[..., None]
@@ -61,8 +59,8 @@ class Stage:
         return [place for place in self.places() if place.written]
 
     def state(self) -> str:
-        """new: no output is there; done: all are, whole, and made by this command from the same input; begun: some are,
-        or not whole; other: another command or input made one of them."""
+        """new: nothing is there; done: all outputs are, whole and of this command and input; begun: some; other: of
+        another."""
         there = [
             path
             for out in self.outputs()
@@ -135,8 +133,8 @@ def init(everything: Annotated[bool, arg(name="all")] = False) -> None:
     for name in STAGES:
         print(f"\n[{name}]")
         for option in _options(name):
-            value = EXAMPLE[name].get(_key(option))
-            if value is not None or _is_bare(option) or everything or is_essential(name, option):
+            value = EXAMPLE[name].get(option.key)
+            if value is not None or option.is_bare or everything or is_essential(name, option):
                 print(*_entry(option, value, before), sep="\n")
         before = EXAMPLE[name].get("out", before)
 
@@ -168,15 +166,8 @@ def _stages(path: Path) -> list[Stage]:
         words = _words(name, table, path, before)
         found.append(_parsed(name, words, path))
         before = table.get("out", before)
-    _require_apart(found, path)
-    return found
-
-
-def _require_apart(stages: Sequence[Stage], path: Path) -> None:
-    """`InputError` for a stage that would write over the pipeline file, or over what a stage reads and none makes, or
-    another one makes."""
     read, made = [Place("PIPELINE", path, written=False)], list[Place]()
-    for stage in stages:
+    for stage in found:  # which must not write over the pipeline file, an input, or what another stage makes
         places = stage.places()
         read += [one for one in places if not (one.written or any(map(one.is_same, made)))]
         made += [one for one in places if one.written]
@@ -184,6 +175,7 @@ def _require_apart(stages: Sequence[Stage], path: Path) -> None:
             require_apart([*read, *made])
         except InputError as error:
             raise InputError(f"[{stage.name}] of {path}: {error}") from None
+    return found
 
 
 def _require_known(table: Mapping[str, Any], known: Sequence[str], where: str, are: str) -> None:
@@ -197,25 +189,16 @@ def _require_known(table: Mapping[str, Any], known: Sequence[str], where: str, a
 
 def _options(name: str) -> list[Option]:
     """The options of a stage: those of its command, but for those of one call alone."""
-    return [one for one in options_of(parser_of(command(name), name)) if f"--{_key(one)}" not in OF_ONE_CALL]
-
-
-def _key(option: Option) -> str:
-    """What an option is called in a pipeline file."""
-    return option.name.replace("_", "-")
-
-
-def _is_bare(option: Option) -> bool:
-    return not option.action.option_strings
+    return [one for one in options_of(parser_of(command(name), name)) if f"--{one.key}" not in OF_ONE_CALL]
 
 
 def _words(name: str, table: Mapping[str, Any], path: Path, before: str | None) -> list[str]:
     """The words of a command line that a stage's table stands for; before: what the stage before it writes."""
-    options = {_key(option): option for option in _options(name)}
+    options = {option.key: option for option in _options(name)}
     _require_known(table, list(options), f"[{name}] of {path} has", "the keys are")
     words: list[str] = []
     for key, option in options.items():
-        value = table.get(key, before if _is_bare(option) else None)
+        value = table.get(key, before if option.is_bare else None)
         require(value is not None or not option.required, f"[{name}] of {path} must have the key {key}; add it.")
         if value is not None:
             words += _said(option, value, f"{key} in [{name}] of {path}")
@@ -224,18 +207,18 @@ def _words(name: str, table: Mapping[str, Any], path: Path, before: str | None) 
 
 def _said(option: Option, value: Any, called: str) -> Iterator[str]:
     """The words for one option. Errors: `InputError` for values that no option has."""
-    flag = f"--{_key(option)}"
+    flag = f"--{option.key}"
     kinds, said = (bool, "true or false") if option.is_switch else (str | int | float | list, "a text, number or list")
     fits = isinstance(value, kinds) and isinstance(value, bool) == option.is_switch
     require(fits, f"{called} must be {said}, but it is {shown(value)}.")
     if option.is_switch:
-        yield flag if value else f"--no-{_key(option)}"
+        yield flag if value else f"--no-{option.key}"
         return
     values = list(map(str, _flat(value)))
     if option.is_repeatable:
         yield from (word for each in values for word in (flag, each))
     elif values:
-        yield from [*([] if _is_bare(option) else [flag]), *values]
+        yield from [*([] if option.is_bare else [flag]), *values]
 
 
 def _flat(value: Any) -> Iterator[Any]:
@@ -268,14 +251,14 @@ def _entry(option: Option, value: str | None, before: str) -> Iterator[str]:
     """The lines of an option in a pipeline file: its text, and its value or, in a comment, its default."""
     yield from (f"# {line}" for line in wrap(option.text, 110))
     if value is not None:
-        yield f'{_key(option)} = "{value}"'
+        yield f'{option.key} = "{value}"'
     else:
-        yield f"# {_key(option)} = {_default(option, before)}"
+        yield f"# {option.key} = {_default(option, before)}"
 
 
 def _default(option: Option, before: str) -> str:
     """The default of an option as TOML, or what stands for its value."""
-    if _is_bare(option):
+    if option.is_bare:
         return f'"{before}"'
     if option.is_switch:
         return option.default.lower()

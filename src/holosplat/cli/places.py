@@ -22,8 +22,7 @@ from tyro.conf import Positional, arg
 
 from ..checks import InputError, require
 from ..io.atomic import is_taken, read_json, require_new, require_parent
-from ..io.leftovers import LOCK
-from ..io.lock import require_unwritten
+from ..io.lock import LOCK, require_unwritten
 from ..io.provenance import NAME, Command, beside, carried_out, records
 from ..ranges import flag, hints_of, with_checked_numbers
 from ..workflows.provenance import MANIFEST
@@ -69,8 +68,7 @@ class Place:
         return False
 
     def companions(self) -> Iterator[Place]:
-        """What is read or written with it: β where a file holds δ alone, where a file that is written comes from, and
-        the scan of a run that is read."""
+        """What goes with it: the file of β, the record of an output's origin, and the scan of a run that is read."""
         if self.path.suffix.lower() in PAIRED:
             from ..io.plain_values import both  # needs more than options do
 
@@ -89,9 +87,8 @@ class Place:
 
 
 def with_checked_arguments(function: Callable[Given, Returned]) -> Callable[..., Returned]:
-    """A command, or an act of one, that refuses numbers out of their ranges and outputs that would damage its input or
-    replace what is there; with the options --log and, where it writes, --force. What it writes says where it comes
-    from."""
+    """A command, or an act of one, with the options --log and, where it writes, --force. It refuses numbers out of
+    range and outputs that would damage its input or replace what is there, and records where outputs come from."""
     signature, hints = inspect.signature(function), hints_of(function)
     writes = any(map(is_written, _leaves(hints)))
 
@@ -128,8 +125,8 @@ def places_of(function: Callable[..., Any], values: Mapping[str, Any]) -> list[P
 
 
 def require_apart(places: Sequence[Place]) -> None:
-    """`InputError` that names the first output which is an input, another output, or within a run or an input; with
-    each path goes what belongs to it (`Place.companions`)."""
+    """`InputError` for an output that is an input, another output, or within a run or an input, with their
+    companions."""
     for place in places:
         require(
             not place.written or bool(place.path.name),
@@ -140,8 +137,9 @@ def require_apart(places: Sequence[Place]) -> None:
     outputs = [one for one in every if one.written]
     for number, out in enumerate(outputs):
         for other in outputs[:number]:
+            alike = [(one.path.parent.resolve(), TIME.sub("", one.path.name)) for one in (out, other)]
             require(
-                not (out.is_same(other) or _of_one_series(out.path, other.path)),
+                not out.is_same(other) and alike[0] != alike[1],  # nor files of single times
                 f"{out.flag} and {other.flag} must be different places, but they are {out.path} and {other.path}; name "
                 "another one.",
             )
@@ -152,7 +150,16 @@ def require_apart(places: Sequence[Place]) -> None:
                 f"{folder}; name another place.",
             )
         for source in read:
-            _require_kept(out, source)
+            require(
+                not out.is_same(source),
+                f"{out.flag} must not be what the command reads, but {out.path} is; name another place.",
+            )
+            inside = out.path.is_file() and source.path.is_dir() and _is_in(out.path, source.path)
+            require(
+                not inside,
+                f"{out.flag} must not replace a file of the folder {source.path}, which the command reads, but "
+                f"{out.path} is one; name another place.",
+            )
 
 
 def _require_free(out: Place, places: Sequence[Place], force: bool, resume: bool | None) -> None:
@@ -201,8 +208,7 @@ def _aside(folder: Path) -> Path:
 
 @contextmanager
 def _set_aside(paths: Sequence[Path]) -> Iterator[None]:
-    """In the block, folders among `paths` have another name; they go when something has taken their place, and come
-    back otherwise."""
+    """In the block, folders among `paths` have another name; then they go, or come back where nothing replaced them."""
     folders = [path.absolute() for path in _folders(paths)]
     try:
         for folder in folders:
@@ -211,17 +217,12 @@ def _set_aside(paths: Sequence[Path]) -> Iterator[None]:
     finally:
         for folder in folders:
             if is_taken(folder):
-                _discard(_aside(folder))
+                if _aside(folder).is_symlink():
+                    _aside(folder).unlink()
+                shutil.rmtree(_aside(folder), ignore_errors=True)
             elif _aside(folder).is_dir():
                 shutil.rmtree(folder, ignore_errors=True)
                 os.rename(_aside(folder), folder)
-
-
-def _discard(folder: Path) -> None:
-    """Remove a folder, or a link to one."""
-    if folder.is_symlink():
-        folder.unlink()
-    shutil.rmtree(folder, ignore_errors=True)
 
 
 def of_times(path: Path) -> list[Path]:
@@ -236,28 +237,8 @@ def is_run(folder: Path) -> bool:
     return (folder / CONFIG).is_file() and any((folder / name).exists() for name in OF_A_RUN)
 
 
-def _require_kept(out: Place, source: Place) -> None:
-    """`InputError` where writing `out` takes away `source`, or a file in it."""
-    require(
-        not out.is_same(source),
-        f"{out.flag} must not be what the command reads, but {out.path} is; name another place.",
-    )
-    inside = out.path.is_file() and source.path.is_dir() and _is_in(out.path, source.path)
-    require(
-        not inside,
-        f"{out.flag} must not replace a file of the folder {source.path}, which the command reads, but {out.path} is "
-        "one; name another place.",
-    )
-
-
 def _is_in(path: Path, folder: Path) -> bool:
     return Path(os.path.realpath(folder)) in Path(os.path.realpath(path)).parents
-
-
-def _of_one_series(one: Path, other: Path) -> bool:
-    """Whether files of single times of the one may have the name of the other, or of its files."""
-    names = [(path.parent.resolve(), TIME.sub("", path.name)) for path in (one, other)]
-    return names[0] == names[1]
 
 
 def _places(values: Mapping[str, Any], hints: Mapping[str, Any]) -> Iterator[Place]:
@@ -268,16 +249,12 @@ def _places(values: Mapping[str, Any], hints: Mapping[str, Any]) -> Iterator[Pla
                 yield from _places(vars(one), hints_of(type(one)))
             elif isinstance(one, Path):
                 hint = hints.get(name)
-                yield Place(_called(name, hint), one, is_written(hint), is_written(hint, GOES_ON))
+                called = name.upper() if POSITIONAL in getattr(hint, "__metadata__", ()) else flag(name)
+                yield Place(called, one, is_written(hint), is_written(hint, GOES_ON))
             elif isinstance(one, str) and one:
                 texts = {one, one.partition("=")[2], one.rpartition(":")[0]} - {""}
                 files = (Place(flag(name), Path(text), False) for text in texts if "\0" not in text)
                 yield from (file for file in files if file.is_there() and file.path.is_file())
-
-
-def _called(name: str, hint: Any) -> str:
-    """How messages call an argument: by its flag, or by its name in capitals where it stands alone."""
-    return name.upper() if POSITIONAL in getattr(hint, "__metadata__", ()) else flag(name)
 
 
 def is_written(hint: Any, mark: str = WRITTEN) -> bool:

@@ -5,28 +5,28 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 from tyro.conf import arg
 
 from ..checks import in_range, require
 from ..frames import evenly
-from ..planning.contrast import Setup
-from ..planning.plan import Motion, Plan, Recording, Sampling, Storage, Survey, Waves, experiment
+from ..io.atomic import atomic_path, require_writable, write_rows
+from ..io.provenance import require_free
+from ..matter import MaterialPrior
+from ..mesh import TriangleMesh
+from ..planning.contrast import Setup, Subject
+from ..planning.plan import Motion, Plan, Recording, Sampling, Storage, Survey, experiment, survey
 from ..planning.plan import plan as make_plan
 from ..progress import Advance
 from ..ranges import Grams, Many, Metres, Positive, Signed, Small, checked_dataclass
+from ..scan import DISTANCE_RANGE_M, ENERGY_RANGE_KEV
 from ..units import in_percent
 from .options import MaterialOptions
 from .places import Output
 from .progress import ProgressBar
 from .sentence import say
-
-if TYPE_CHECKING:
-    from ..mesh import TriangleMesh
-    from ..planning.contrast import Subject
-    from ..workflows.rehearsal import Rehearsal
 
 CELL_DIAMETER = 8e-6
 LEVEL = 4
@@ -61,7 +61,6 @@ class ObjectOptions:
     def subject(self) -> Subject:
         """The object that the options name."""
         from ..materials import Transparent
-        from ..planning.contrast import Subject
 
         filling = MaterialOptions(self.material, self.density, self.medium, self.medium_density).filling()
         assert filling.material is not None
@@ -70,7 +69,6 @@ class ObjectOptions:
 
     def _shape(self) -> TriangleMesh:
         from ..io.vtk import read_meshes
-        from ..mesh import TriangleMesh
         from ..specimens.red_cells import evans_fung_cell, icosphere
         from ..specimens.repair import closed
 
@@ -120,10 +118,6 @@ class RangeOptions:
 
     def check(self) -> None:
         """`InputError` unless ranges and files go together."""
-        from ..io.atomic import require_writable
-        from ..io.provenance import require_free
-        from ..scan import DISTANCE_RANGE_M, ENERGY_RANGE_KEV
-
         if not self.wanted:
             require(self.out is None, "--out needs --distance-range or --energy-range, or both.")
             return
@@ -145,10 +139,6 @@ class RangeOptions:
 
     def run(self, subject: Subject, setup: Setup, photons: float, on_progress: Advance) -> Survey:
         """The survey of the ranges: distances in equal ratios, energies in equal steps."""
-        import numpy as np
-
-        from ..planning.plan import survey
-
         distances, energies = [setup.distance], [setup.energy_kev]
         if self.distance_range is not None:
             distances = np.geomspace(*self.distance_range, self.points[0])
@@ -181,7 +171,16 @@ def plan(
     if ranges.wanted:
         with ProgressBar() as bar:
             surveyed = ranges.run(subject, beam, record.photons_per_pixel, bar.of("surveying"))
-    foreseen = None if times is None else _foreseen(subject, beam, record, times)
+    foreseen = None
+    if times is not None:
+        from ..methods import METHODS
+        from ..workflows.preconditions import FEWEST_COLUMNS
+        from ..workflows.rehearsal import SIDE, foresee
+
+        scene, exposures, photons = experiment(subject, beam, record, SIDE, FEWEST_COLUMNS)
+        prior, method = MaterialPrior.known(subject.contrast(beam.energy_kev)), METHODS["holographic-tv"]
+        with ProgressBar() as bar:
+            foreseen = foresee(scene, exposures, photons, prior, method, times=times, on_progress=bar.show)
     if as_json:
         found = _as_dict(what.name(), beam, record, planned, surveyed)
         found |= {} if foreseen is None else {"rehearsal": foreseen.as_dict()}
@@ -195,19 +194,6 @@ def plan(
     if surveyed is not None and ranges.out is not None:
         _write(ranges.out, surveyed)
         say(f"wrote {ranges.out} and {ranges.out.with_suffix('.csv')}")
-
-
-def _foreseen(subject: Subject, setup: Setup, recording: Recording, times: int) -> Rehearsal:
-    from ..matter import MaterialPrior
-    from ..methods import METHODS
-    from ..workflows.preconditions import FEWEST_COLUMNS
-    from ..workflows.rehearsal import SIDE, foresee
-
-    scene, exposures, photons = experiment(subject, setup, recording, SIDE, FEWEST_COLUMNS)
-    prior = MaterialPrior.known(subject.contrast(setup.energy_kev))
-    with ProgressBar() as bar:
-        method = METHODS["holographic-tv"]
-        return foresee(scene, exposures, photons, prior, method, times=times, on_progress=bar.show)
 
 
 def _as_dict(name: str, setup: Setup, recording: Recording, planned: Plan, surveyed: Survey | None) -> dict[str, Any]:
@@ -238,7 +224,6 @@ def _numbers(values: dict[str, Any]) -> dict[str, Any]:
 
 def _write(path: Path, surveyed: Survey) -> None:
     """The picture and the table of a survey."""
-    from ..io.atomic import atomic_path, write_rows
     from ..report.plan import survey_figure  # matplotlib, which most plans need not
 
     rows = surveyed.table()
@@ -270,12 +255,14 @@ Group = tuple[str, list[tuple[str, str]]]
 
 def _waves(plan: Plan) -> Group:
     waves = plan.waves
+    fringe = f"{_length(waves.fringe)}, {waves.fringe_px:.3g} px" if waves.fringe else "none: absorption alone"
+    fringe += " (finer than two pixels: blurred)" if 0 < waves.fringe_px < 2 else ""
     absorbed = f"{in_percent(abs(waves.absorption))} {'more' if waves.absorption >= 0 else 'less'} than the medium"
     rows = [
         ("Δδ, Δβ", f"{waves.delta:.3g}, {waves.beta:.3g}"),
         ("Fresnel number, object's radius", f"{waves.fresnel_object:.3g}"),
         ("Fresnel number, pixel", f"{waves.fresnel_pixel:.3g}"),
-        ("first fringe √(λz)", _fringe(waves)),
+        ("first fringe √(λz)", fringe),
         ("largest phase shift", f"{waves.phase:.3g} rad"),
         ("largest absorption", absorbed),
         ("contrast, least to greatest", f"{waves.contrast_low:+.3g} to {waves.contrast_high:+.3g}"),
@@ -283,13 +270,6 @@ def _waves(plan: Plan) -> Group:
         ("90 % of the signal lies within", _length(waves.spread)),
     ]
     return "one object", rows
-
-
-def _fringe(waves: Waves) -> str:
-    if waves.fringe == 0:
-        return "none: absorption alone"
-    blurred = " (finer than two pixels: blurred)" if waves.fringe_px < 2 else ""
-    return f"{_length(waves.fringe)}, {waves.fringe_px:.3g} px{blurred}"
 
 
 def _detection(recording: Recording, plan: Plan) -> Group:

@@ -60,8 +60,7 @@ def say_notes() -> None:
 
 
 class ProgressBar:
-    """Progress of one stage after another, on standard error: a bar on a terminal, else and in a log a line now and
-    then. clock: the time [s]."""
+    """Progress on standard error: a bar on a terminal, else (and in a log) a line now and then. clock: the time [s]."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._bar: tqdm | None = None
@@ -80,17 +79,17 @@ class ProgressBar:
         return partial(self.show, stage)
 
     def show(self, stage: str, fraction: float, record: Mapping[str, float] = MappingProxyType({})) -> None:
-        """Stage `stage` is done to `fraction`; the fit's last `record` adds loss, count and steps a second.
-
-        The time left goes by the mean speed since the stage was first shown, from where it then was: what is resumed
-        does not begin with nothing.
-        """
+        """Show that a stage is done to `fraction`, with loss, count and steps a second of a fit's `record`. The time
+        left goes by the mean speed since the stage was first shown."""
         fraction = max(0.0, min(1.0, fraction))
         if stage != self._stage:
             self._close()
-            self._stage = stage
-            self._bar, self._lines = _bar(stage, fraction), _lines(stage, fraction, self._clock)
-        said = _described(record) if record else ""
+            self._begin(stage, fraction)
+        said = ""
+        if record:
+            speed = record["step"] / record["seconds"] if record["seconds"] > 0 else 0.0
+            size = f"{record['count']:.0f} Gaussians, " if "count" in record else ""
+            said = f"loss {record['loss']:.3e}, {size}{speed:.1f} steps/s"
         if self._lines is not None:
             self._lines.show(fraction, said)
         if self._bar is not None:
@@ -98,6 +97,18 @@ class ProgressBar:
                 self._bar.set_postfix_str(said, refresh=False)
             self._bar.bar_format = _WITH_LEFT if _tells(self._bar.initial, fraction) else _FORMAT
             self._bar.update(max(0.0, fraction - self._bar.n))
+
+    def _begin(self, stage: str, fraction: float) -> None:
+        """A bar on a terminal, and lines in the log, if there is one; elsewhere lines on standard error."""
+        self._stage, log = stage, sys.stderr.log if isinstance(sys.stderr, Copied) else None
+        if not sys.stderr.isatty():
+            self._lines = _Lines(stage, fraction, self._clock, lambda line: print(line, file=sys.stderr, flush=True))
+            return
+        from tqdm import tqdm
+
+        how = {"bar_format": _FORMAT, "file": sys.stderr, "mininterval": 0.2, "smoothing": 0}
+        self._bar = tqdm(total=1.0, initial=fraction, desc=stage, **how)
+        self._lines = None if log is None else _Lines(stage, fraction, self._clock, log.say)
 
     def _close(self) -> None:
         whole = sys.exc_info()[0] is None
@@ -111,8 +122,7 @@ class ProgressBar:
 
 
 class _Lines:
-    """Progress of one stage as lines: its name, and a line for each twentieth and for its end, none of them within
-    seconds of another, but one every minute."""
+    """Progress of one stage as lines: one each twentieth, not within seconds of another, but one every minute."""
 
     def __init__(self, stage: str, begun: float, clock: Callable[[], float], say: Callable[[str], None]) -> None:
         self._stage, self._begun, self._clock, self._say = stage, begun, clock, say
@@ -133,23 +143,6 @@ class _Lines:
         self._shown, self._at = fraction, now
 
 
-def _bar(stage: str, begun: float) -> tqdm | None:
-    """The bar of a stage, on a terminal."""
-    if not sys.stderr.isatty():
-        return None
-    from tqdm import tqdm
-
-    return tqdm(total=1.0, initial=begun, desc=stage, bar_format=_FORMAT, file=sys.stderr, mininterval=0.2, smoothing=0)
-
-
-def _lines(stage: str, begun: float, clock: Callable[[], float]) -> _Lines | None:
-    """The lines of a stage: on standard error, or, where that is a terminal, in the log alone."""
-    log = log_of(sys.stderr)
-    if not sys.stderr.isatty():
-        return _Lines(stage, begun, clock, lambda line: print(line, file=sys.stderr, flush=True))
-    return None if log is None else _Lines(stage, begun, clock, log.say)
-
-
 def _tells(begun: float, fraction: float) -> bool:
     """Whether enough is done, and not all, to say how long the rest takes."""
     return begun + TOLD * (1 - begun) <= fraction < 1 and fraction > begun
@@ -164,12 +157,6 @@ def _spent(seconds: float) -> str:
 
 _FORMAT = "{desc:28s} {percentage:3.0f}%|{bar:24}| {elapsed}{postfix}"
 _WITH_LEFT = _FORMAT.replace("{elapsed}", "{elapsed}, {remaining} left")
-
-
-def _described(record: Mapping[str, float]) -> str:
-    speed = record["step"] / record["seconds"] if record["seconds"] > 0 else 0.0
-    size = f"{record['count']:.0f} Gaussians, " if "count" in record else ""
-    return f"loss {record['loss']:.3e}, {size}{speed:.1f} steps/s"
 
 
 OWN = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d ")
@@ -209,18 +196,10 @@ class Copied:
         return self._stream.write(text)
 
 
-def log_of(stream: Any) -> Log | None:
-    """The log to which the lines of a stream go, if there is one."""
-    return stream.log if isinstance(stream, Copied) else None
-
-
 @contextmanager
 def logged(arguments: Sequence[str]) -> Iterator[None]:
-    """Copy what the command with these `arguments` says to the file that --log names, behind what is there; nothing
-    without that option.
-
-    Errors: `InputError` for a file that is there and is no log.
-    """
+    """Add what the command with these `arguments` says to the file that --log names, if it does; `InputError` for a
+    file that is no log."""
     path = _named(arguments)
     if path is None:
         yield

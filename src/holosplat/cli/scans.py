@@ -1,31 +1,40 @@
-"""The frames of a scan that a run can be compared with, and the run as it is at their time."""
+"""What commands do with finished runs: the frames to compare them with, scores, predictions, rehearsals."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+import json
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
-from ..checks import require
-from ..io.formats import read_frames, run_reading
-from ..io.reading import Reading, at_time
-from ..mesh import TriangleMesh
-from ..representations import InMotion, MovingSurfaces, SurfaceMesh
+from ..checks import as_written, require
+from ..io.atomic import read_json, require_writable
+from ..io.formats import read_frames, read_volume_file, run_reading, run_source
+from ..io.nxtomo import write_scan
+from ..io.reading import Part, Reading, at_time
+from ..methods.continued import Continued
+from ..methods.presets import method_of
+from ..methods.solve import Settled
+from ..report.compare import Side, side_of
+from ..report.run import report_run
 from ..scan import Scan
+from ..series.collect import collect
 from ..series.folder import SeriesFolder
+from ..series.plan import prior_of
+from ..tables import from_table
+from ..workflows.evaluate import TIMES, evaluate, render, require_overlap, require_same_field, write_times
 from ..workflows.preconditions import require_one_time
+from ..workflows.provenance import scan_hash
 from ..workflows.reconstruct import load_reconstruction
-from ..workflows.reconstruction import Reconstruction, chosen_frames, instants_of, reconstruction_at, where_found
-from ..workflows.run_folder import RunFolder
+from ..workflows.reconstruction import Reconstruction, instants_of, reconstruction_at, where_found
+from ..workflows.rehearsal import rehearse
+from ..workflows.run_folder import RunFolder, claimed
+from .progress import ProgressBar
+from .sentence import put, say, tell_result
 
 
 def scan_for(folder: RunFolder, scan: Path | None, reading: Reading) -> Scan:
-    """A scan to compare a run with: of a time-resolved one, the frames of the time that the run is of.
-
-    scan: None is the run's own, read as the run did, but for what `reading` says otherwise. Where the run refined the
-    geometry, its own frames are where it found them.
-    """
+    """A scan to compare a run with, at the time that the run is of. scan: None is the run's own, read as the run did
+    and as `reading` says, where it found the geometry to be."""
     own = run_reading(folder.path) if folder.source.is_file() else Reading()
     if scan is None:
         found = read_frames(folder.source_scan(), reading.over(own))
@@ -39,11 +48,8 @@ def scan_for(folder: RunFolder, scan: Path | None, reading: Reading) -> Scan:
 
 
 def run_and_scan(folder: RunFolder, scan: Path | None, reading: Reading) -> tuple[Reconstruction, Scan]:
-    """A run, and the scan to compare it with (see `scan_for`).
-
-    Of a run in motion --time-frame chooses the time of both; without it, frames of all times are compared with the
-    bodies at these. Errors: `InputError` for times that the run does not have.
-    """
+    """A run, and the scan to compare it with (`scan_for`); of a run in motion both at --time-frame, or at all times.
+    Errors: `InputError` for times that the run does not have."""
     result, times = load_reconstruction(folder), instants_of(folder)
     if not times:
         return result, scan_for(folder, scan, reading)
@@ -53,18 +59,6 @@ def run_and_scan(folder: RunFolder, scan: Path | None, reading: Reading) -> tupl
     else:
         reading = replace(reading, part=replace(reading.part, time_frame=None))
     return result, scan_for(folder, scan, reading)
-
-
-@dataclass(frozen=True)
-class Moment:
-    """A run as it is at one time. frame: the time's number, which names of its files add, or None; time [s]; bodies:
-    closed meshes [m], if it has them, of a run in motion in the order of their identities; folder: of the run."""
-
-    frame: int | None
-    time: float
-    result: Reconstruction
-    bodies: list[TriangleMesh] | None
-    folder: RunFolder
 
 
 def runs_of(path: Path) -> list[tuple[float, RunFolder]]:
@@ -77,34 +71,115 @@ def runs_of(path: Path) -> list[tuple[float, RunFolder]]:
     return [(moment.time, RunFolder(series.run(task, moment.number))) for task, moment in each]
 
 
-def moments_of(folder: RunFolder, time_frame: int | Literal["all"] | None) -> Iterator[Moment]:
-    """A run, or a series of single times, at the times that are asked for.
+def report_of_middle(folder: RunFolder, result: Reconstruction, measured: Scan) -> Path:
+    """The report of a run of several times at the one in the middle."""
+    times = measured.train().instants.tolist()
+    middle = len(times) // 2
+    shown = measured[(measured.exposures.time == times[middle]).nonzero()[0]].as_static()
+    now = reconstruction_at(result, times, middle)
+    whole = f"This is the time {1e6 * times[middle]:.4g} µs, of {len(measured)} frames of {len(times)} times in all."
+    return report_run(folder, now, shown, evaluate(now, shown, None), None, whole)
 
-    time_frame: of a series and of a run in motion, the time, counted from 0 (default: the first), or "all". Errors:
-    `InputError` for times that they do not have or that are not done, before the first, and for any of a run that
-    stands still.
-    """
-    runs = runs_of(folder.path)
-    chosen = chosen_frames(time_frame, [time for time, _ in runs]) if runs else []
-    for k in chosen:
-        require(
-            runs[k][1].config.is_file() and runs[k][1].result().is_file(),
-            f"time {k} of {folder.path} is not done; finish it with holosplat series run {folder.path}, or name "
-            "another --time-frame.",
-        )
-    for k in chosen:
-        time, run = runs[k]
-        result = load_reconstruction(run)
-        bodies = result.object.bodies() if isinstance(result.object, SurfaceMesh) else None
-        yield Moment(k if time_frame == "all" else None, time, result, bodies, run)
-    if runs:
-        return
-    result, times = load_reconstruction(folder), instants_of(folder)
-    found = result.object
-    if not isinstance(found, InMotion):
-        require(time_frame is None, f"{folder.path} is of one time; leave --time-frame.")
-        yield Moment(None, 0.0, result, found.bodies() if isinstance(found, SurfaceMesh) else None, folder)
-        return
-    for k in chosen_frames(time_frame, times):
-        bodies = found.bodies(times[k]) if isinstance(found, MovingSurfaces) else None
-        yield Moment(k if time_frame == "all" else None, times[k], reconstruction_at(result, times, k), bodies, folder)
+
+def scored(folder: RunFolder, result: Reconstruction, measured: Scan, scan: Path, reading: Reading) -> Path:
+    """Print the scores of a run on its frames, and write its report; the folder then knows where its frames are."""
+    found = reading.told.found({each.name: each.value for each in result.constants})
+    folder.write_source(run_source(scan, replace(reading, told=found)))
+    placed = result.placed(measured)
+    evaluation = evaluate(result, placed, None)
+    put(evaluation.lines())
+    if reading.part.time_frame in ("all", "still"):
+        every = replace(reading, told=reading.told.at_middle(), part=replace(reading.part, time_frame=None))
+        each = result.placed(read_frames(scan, every)).in_memory()
+        write_times(folder.path / TIMES, result, each, evaluation.light)
+    if instants_of(folder):
+        return report_of_middle(folder, result, placed)
+    return report_run(folder, result, placed, evaluation, None)
+
+
+def tell_found(folder: RunFolder, result: Reconstruction, report: Path) -> None:
+    """What was found and decided, and whether it explains the frames."""
+    if folder.light.is_file():
+        say(f"light: {read_json(folder.summary)['light']} ({folder.light})")
+    put(constant.line() for constant in result.constants)
+    put(result.geometry.lines() if result.geometry else ())
+    put(result.choice.lines())
+    tell_result(folder, result, report)
+    if result.total:
+        print(result.total.words)
+    say(f"not rehearsed: for intervals of these numbers, and a verdict beside them: holosplat rehearse {folder.path}")
+
+
+def predict(run: Path, scan: Path, out: Path, split: str, reading: Reading) -> None:
+    """Write the frames of a split of a scan as a run predicts them."""
+    require_writable(out)
+    result, wanted = run_and_scan(RunFolder(run), scan, reading)
+    chosen = {"test": wanted.test, "train": wanted.train, "all": lambda: wanted}[split]()
+    require(len(chosen) > 0, f"{scan} has no {split} frames to render; choose another --split.")
+    frames = render(result, chosen.exposures)
+    write_scan(out, Scan(frames, chosen.exposures, chosen.is_test, {"rendered_from": run.name}))
+    say(f"wrote {out}: {len(frames)} predicted frames")
+
+
+def judge(run: Path, scan: Path | None, truth: Path | None, as_json: bool, reading: Reading) -> None:
+    """Print the scores of a run, by a truth, too, and renew its report by that."""
+    folder = RunFolder(run)
+    result, measured = run_and_scan(folder, scan, reading)
+    true_volume = read_volume_file(truth, result.delta_told) if truth else None
+    if truth is not None and true_volume is not None:
+        require_same_field(true_volume.grid, measured.views, truth)
+    evaluation = evaluate(result, measured, true_volume)
+    if truth is not None and evaluation.volume is not None:
+        require_overlap(evaluation.volume, truth)
+    if as_json:
+        print(json.dumps(evaluation.as_dict(), indent=2, allow_nan=False))
+    else:
+        put(evaluation.lines())
+    if instants_of(folder):
+        return  # its report is of the time in the middle
+    if not folder.is_of(scan_hash(measured)):
+        say("this is not the scan that was reconstructed, its frames may have been fitted; report unchanged")
+    elif true_volume is not None or not folder.report.exists():
+        with claimed(folder):
+            say(f"report: {report_run(folder, result, measured, evaluation, true_volume)}")
+
+
+def side_of_run(path: Path) -> Side:
+    """A run with its scores, as far as its scan is still there."""
+    folder, scan = RunFolder(path), None
+    folder.require_run()
+    told = read_json(folder.source).get("scan") if folder.source.is_file() else None
+    if told and Path(str(told)).exists():
+        scan = scan_for(folder, None, Reading(part=Part(time_frame=0)) if instants_of(folder) else Reading())
+    return side_of(folder, scan)
+
+
+def rehearse_each(run: Path, times: int, bins: int | None, reading: Reading) -> None:
+    """Rehearse a run, or every time that is done of a series, whose table is then written again."""
+    each = runs_of(run)
+    for number, (_, folder) in enumerate(each):
+        if folder.result().is_file():
+            say(f"time {number}:")
+            _rehearse(folder, times, bins, reading)
+    if each:
+        collect(series := SeriesFolder(run))
+        say(f"wrote {series.table}")
+    else:
+        _rehearse(RunFolder(run), times, bins, reading)
+
+
+def _rehearse(folder: RunFolder, times: int, bins: int | None, reading: Reading) -> None:
+    result, measured = run_and_scan(folder, None, reading)
+    config = folder.read_config()
+    with as_written(folder.config, "what reconstruct wrote"):
+        told = dict(config["method"])
+        method = from_table(Continued, told) if told.get("kind") == Continued.kind else method_of(told, "method")
+        method = Settled.again(method, config["decided"]).method
+        prior, seed = prior_of(config["prior"]), int(config["seed"])
+    with claimed(folder):
+        with ProgressBar() as bar:
+            how = {"times": times, "bins": bins, "seed": seed, "folder": folder, "on_progress": bar.show}
+            found = rehearse(result, measured, prior, method, **how)
+        page = report_run(folder, result, measured, evaluate(result, measured, None), None)
+    put(found.lines())
+    say(f"report: {page}")

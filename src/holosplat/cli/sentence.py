@@ -1,5 +1,4 @@
-"""What commands say on standard error: sentences, what a job takes, held against what there is before it begins, and
-the sentence of the end."""
+"""What commands say: sentences on standard error, what a job takes and whether there is room, and the end."""
 
 from __future__ import annotations
 
@@ -14,6 +13,8 @@ if TYPE_CHECKING:
     from ..methods import Method
     from ..planning.needs import Needs
     from ..scan import Exposures, Scan
+    from ..workflows.reconstruction import Reconstruction
+    from ..workflows.run_folder import RunFolder
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
@@ -65,24 +66,12 @@ def tell_reconstruction(
         tell(method.kind, needs, out, smaller(exposures, method, kind))
 
 
-def tell_each_time(exposures: Exposures, out: Path, method: Method, matter: MatterKind | None) -> None:
-    """The same where each time is reconstructed by itself."""
-    from ..planning.acts import of_each_time, one_time, times_of
-    from ..planning.scan_facts import smaller
+def tell_result(folder: RunFolder, result: Reconstruction, report: Path) -> None:
+    """Say what a run has found and where its report is, and print whether that explains the frames."""
+    from ..workflows.evaluate import TIMES, lines_of_times
 
-    if len(exposures) == 0:
-        return
-    needs = of_each_time(exposures, method, matter)
-    if needs is not None:
-        others = smaller(one_time(exposures), method, matter)
-        tell(f"{times_of(exposures)} times", needs, out, ((how, one.times(times_of(exposures))) for how, one in others))
-
-
-def tell_simulation(exposures: Exposures, out: Path, samples: int, frames: int) -> None:
-    """The same for a simulation of `frames`, with so many wave samples along a pixel."""
-    from ..planning.acts import of_simulation
-
-    tell("the simulation", of_simulation(exposures, samples, frames), out)
+    say(f"{sum(result.timing.values()):.1f} s, {result.object.described}; report: {report}")
+    put((*(result.verdict.lines("training frames") if result.verdict else ()), *lines_of_times(folder.path / TIMES)))
 
 
 def tell(what: str, needs: Needs, out: Path, others: Iterable[tuple[str, Needs]] = ()) -> None:

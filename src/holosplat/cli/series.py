@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from tyro.conf import Positional, arg, subcommand
 
@@ -14,23 +14,23 @@ from ..checks import require
 from ..io.formats import read_frames
 from ..io.reading import Reading
 from ..matter import MaterialPrior
+from ..planning.acts import of_each_time, one_time, times_of
+from ..planning.scan_facts import smaller
 from ..ranges import Jobs, Seed, checked_dataclass
 from ..series.collect import collect as join
 from ..series.folder import Row, SeriesFolder, line_of, table_of, time_left, verdict_of
 from ..series.plan import Cut, Settings, Slurm, Warm, listed, plan_series
-from ..series.run import run_left
+from ..series.run import Counts, counted, run_left, run_on_dask, run_processes, states, submit, write_script
 from ..series.stream import RECEIVED, SCHEME, Stream, Streaming
+from ..series.task import run_task
 from ..series.watch import Watch, WatchFolder, Watching
 from ..tables import to_table
 from ..workflows.verdict import some
 from .light import RunLightFlags
 from .options import MethodOptions, PriorOptions
 from .places import Kept, Output, with_checked_arguments
-from .sentence import interruptible, put, say, tell_each_time
+from .sentence import interruptible, put, say, tell
 from .track import BodyFlags, MotionFlags
-
-if TYPE_CHECKING:
-    from ..series.run import Counts
 
 UNFINISHED = 4
 """Exit code of `series run` and `collect` where tasks failed or are left."""
@@ -41,8 +41,8 @@ class EachTime:
     """What is done with each time."""
 
     warm: bool = True
-    """Begin each time with what the one before ended with, with fewer steps. Where that leaves more of the frames than
-    the last time begun alone did, it is also begun by itself, and the better one is kept. --no-warm: each begins so."""
+    """Start each time from the one before, with fewer steps; where that fits worse than the last time started alone
+    did, the better of both is kept. --no-warm: start each alone."""
     reports: bool = False
     """Write report.html of each run, too, which takes seconds a time."""
 
@@ -86,8 +86,6 @@ class SlurmFlags(Slurm):
 
     def carry_out(self, folder: SeriesFolder, retry: bool) -> None:
         """Write the script, and submit it if that is asked for."""
-        from ..series.run import submit, write_script
-
         count, numbers = write_script(folder, self, retry)
         say(f"wrote {folder.script} for {count} task(s): {numbers}")
         if self.submit:
@@ -147,9 +145,6 @@ def run(
         dask: Or: all that are left, on the Dask cluster whose scheduler has this address, such as tcp://host:8786.
         allow_external: The plan says --allow-external, and you trust the folder and its scans.
     """
-    from ..series.run import counted, run_processes
-    from ..series.task import run_task
-
     ways = [task is not None, jobs != 0, dask is not None, cluster.slurm or cluster.submit]
     require(sum(ways) < 2, "give one of a task's number, --jobs, --dask and --slurm.")
     alone = cluster.block == 1 or task is not None or cluster.slurm or cluster.submit
@@ -168,8 +163,6 @@ def run(
         elif task is not None:
             counts = counted([run_task(series, task, _tell_row)])
         elif dask is not None:
-            from ..series.run import run_on_dask
-
             counts = run_on_dask(series, dask, retry, lambda state: say(f"task {state.number}: {state.state}"))
         elif jobs:
             counts = run_processes(series, jobs, retry)
@@ -196,8 +189,6 @@ def status(folder: Positional[Path]) -> None:
     Args:
         folder: Folder of the series.
     """
-    from ..series.run import states
-
     found = states(SeriesFolder(folder))
     put(table_of(found))
     print(time_left(found))
@@ -243,16 +234,18 @@ def reconstruct_each(
     reading: Reading,
     resume: bool,
 ) -> None:
-    """Make the series of all times of `scan` in the folder `out`, in this process, and its table and page.
-
-    It is what `series plan`, `run` and `collect` make of it, as one task. resume: go on with a folder that was begun.
-    Errors: `InputError` for a folder that is not of this, and what `plan_series` refuses.
-    """
+    """Make the series of all times of `scan` in the folder `out` as one task, with its table and page; resume: go on
+    with a folder that was begun. Errors: `InputError` for another folder, and as of `plan_series`."""
     reading = replace(reading, part=replace(reading.part, time_frame=None))
     every = plan_series([scan], settings, prior, reading, Cut())
     planned = replace(every, cut=Cut(window=len(every.moments())))
-    seen, method, matter = read_frames(scan, reading), settings.method, settings.matter
-    tell_each_time(seen.exposures[~seen.is_test], out, method, matter)
+    measured, method, matter = read_frames(scan, reading), settings.method, settings.matter
+    seen = measured.exposures[~measured.is_test]
+    needs = of_each_time(seen, method, matter) if len(seen) else None
+    if needs is not None:
+        count = times_of(seen)
+        others = ((how, one.times(count)) for how, one in smaller(one_time(seen), method, matter))
+        tell(f"{count} times", needs, out, others)
     folder = SeriesFolder(out)
     if resume and out.exists():
         require(

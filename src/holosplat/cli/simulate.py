@@ -8,11 +8,16 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
 from tyro.conf import Positional
 
 from ..beamline.light import EVEN_LIGHT, UnevenLight
+from ..beamline.misalignment import Misalignment
 from ..checks import InputError, require
+from ..geometry import Grid, Views
+from ..io.atomic import require_writable
 from ..ranges import checked_dataclass
+from ..scan import Exposures
 from .options import (
     BeamlineOptions,
     MaterialOptions,
@@ -23,24 +28,16 @@ from .options import (
 )
 from .places import Output
 from .progress import ProgressBar
-from .sentence import say, tell_simulation
+from .sentence import say, tell
 from .specimen import NO_SPECTRUM, SourceOptions, SpecimenOptions
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from ..beamline.series import Timing
     from ..beamline.simulate import Filling
-    from ..geometry import Views
-    from ..scan import Exposures
-    from ..specimens.carried import CarriedScene
-    from ..specimens.continuous import ContinuousScene
-    from ..specimens.drawn import ChangingScene, Drawn
-    from ..specimens.rods import RodScene
-    from ..specimens.scene import MeshScene, MeshSeries, VoxelScene
+    from ..specimens.drawn import Drawn
+    from ..specimens.scene import MeshScene, MeshSeries
     from ..volume import Object
-
-    Still = MeshScene | ContinuousScene | VoxelScene | CarriedScene | RodScene | ChangingScene
+    from .specimen import Still
 
 
 @checked_dataclass
@@ -52,8 +49,8 @@ class TruthOptions:
     truth_frames: tuple[int, ...] = ()
     """Series: write the true volume at these times instead, counted from 0, to TRUTH_t0000.h5 and so on."""
     truth_regions: bool = False
-    """Matter that may fill the field: also write its named parts, such as bubbles, beside --truth as TRUTH_bubbles.h5
-    and so on; their δ is the share of each voxel that the part fills."""
+    """Also write the named parts of matter that may fill the field, as TRUTH_bubbles.h5 and so on (shares of
+    voxels)."""
     truth_mesh: Output | None = None
     """STL file: the surfaces of the truth, where it has them, in micrometres."""
     true_exposures: Output | None = None
@@ -61,7 +58,6 @@ class TruthOptions:
 
     def require_usable(self, out: Path) -> None:
         """`InputError` unless all files, `out` among them, can be written."""
-        from ..io.atomic import require_writable
         from ..io.formats import volume_format
 
         require(self.truth is not None or not self.truth_frames, "--truth-frames needs --truth.")
@@ -87,8 +83,7 @@ class TruthOptions:
     def of_regions(
         self, regions: Mapping[str, Object], volumes: list[tuple[Path, int]]
     ) -> dict[Path, tuple[Object, int]]:
-        """Each volume file of a named part to write beside those of all matter, the part, and the number of its time;
-        `InputError` where they are wanted of none."""
+        """The file of each named part of matter, the part, and its time's number; `InputError` without such parts."""
         if not self.truth_regions:
             return {}
         require(len(regions) > 0, "--truth-regions is of matter that may fill the field (--specimen); leave it.")
@@ -114,10 +109,8 @@ MOST_FRAMES = 10**6
 
 @dataclass(frozen=True)
 class _Specimen:
-    """What is imaged, and at which times [T] of the frames [s].
-
-    facts: what the scan file says of it; regions: its named parts; goes_on: whether it goes on beyond the field.
-    """
+    """What is imaged at which times [T] of frames [s]; facts for the scan file; regions: named parts; goes_on: beyond
+    the field."""
 
     matter: Still | MeshSeries
     times: np.ndarray
@@ -157,10 +150,10 @@ def simulate(
             one file of any format of `export --volume`, or TIFF images. None with --specimen.
         out: Scan file to write (NXtomo).
     """
-    import numpy as np
-
     from ..backends import resolve
     from ..beamline.series import held_out
+    from ..beamline.simulate import Simulation
+    from ..planning.acts import of_simulation
 
     truth.require_usable(out)
     resolve(experiment.backend)  # before anything is read
@@ -171,7 +164,9 @@ def simulate(
     of_source, beamline = source.facts(beamline), source.applied(beamline)
     named = imaged.generated.in_medium(filling)
     views, filled = source.rays(beamline.planned()), named.filling(beamline.medium_index)
-    true_views = experiment.misalignment.errors().true_exposures(views)
+    off = experiment.misalignment
+    errors = (off.misalign_shift, off.misalign_rotation, off.misalign_distance, off.misalign_seed)
+    true_views = Misalignment(*errors, off.misalign_magnification).true_exposures(views)
     with ProgressBar() as bar:
         times = imaged.generated.timing(motion) if imaged.generated.specimen else np.zeros(1)
         generated = imaged.continuous(files, beamline, filled, float(times[-1]))
@@ -184,8 +179,14 @@ def simulate(
             require(source.light(beamline.energy_kev) is None, NO_SPECTRUM)
             specimen = _still(generated, times, imaged, files, beamline)
     times = specimen.times
-    _require_few(len(views) * len(times))
-    how = replace(experiment.noise.simulation(motion.shutter(), experiment.light), backend=experiment.backend)
+    count = len(views) * len(times)
+    require(
+        count <= MOST_FRAMES,
+        f"views and times must make at most {MOST_FRAMES} frames, but they make {count}; take fewer of --views or "
+        "--frames.",
+    )
+    recorded = {"shutter": motion.shutter(), "light": experiment.light, "backend": experiment.backend}
+    how = Simulation(experiment.noise.photons_per_pixel, experiment.noise.seed, **recorded)
     _say_of_missing_field(specimen, true_views.views, beamline.pixel_size)
     of_poses = motion.hold_out == "views"
     split = beamline.split(len(views)) if of_poses else replace(beamline, distances=()).split(len(times))
@@ -196,12 +197,11 @@ def simulate(
         facts["material"] = named.material
     regions, targets = truth.of_regions(specimen.regions, volumes), [(out, nominal, facts)]
     if truth.true_exposures:
-        targets.append((truth.true_exposures, true, facts | experiment.misalignment.facts()))
-    tell_simulation(true_views, out, how.samples(true_views), len(true))
+        targets.append((truth.true_exposures, true, facts | {name: f"{value:g}" for name, value in vars(off).items()}))
+    tell("the simulation", of_simulation(true_views, how.samples(true_views), len(true)), out)
     if truth.write_mesh(specimen.matter):
         say(f"wrote {truth.truth_mesh}: the true surfaces")
-    with ProgressBar() as bar:
-        _write_frames(targets, is_test, source.frames(specimen.matter, filled, true, how), bar)
+    _write_frames(targets, is_test, source.frames(specimen.matter, filled, true, how))
     text = "{} frames of {} × {} pixels, {} of them held out".format(len(true), *beamline.detector, is_test.sum())
     say(f"wrote {out}: {text}{f', at {len(times)} times from {len(views)} views' if motion.frame_rate else ''}")
     if truth.true_exposures:
@@ -223,9 +223,7 @@ def _specimen(
     bar: ProgressBar,
 ) -> _Specimen:
     """The bodies of `meshes`: moving, where there is a `timing`."""
-    import numpy as np
-
-    from ..beamline.series import read_series
+    from ..beamline.series import SeriesFiles, read_series
     from ..beamline.simulate import read_scene
     from ..io.paraview import COLLECTION, seeming_snapshots
 
@@ -243,7 +241,8 @@ def _specimen(
             )
         return _Specimen(matter, np.zeros(1), _facts(matter))
     show = bar.of("reading snapshots")
-    series, times = read_series(meshes, filling, beamline.energy_kev, timing, files.series(), show)
+    told = SeriesFiles(files.length_unit, files.origin, files.snapshot_interval, files.time_unit, files.period)
+    series, times = read_series(meshes, filling, beamline.energy_kev, timing, told, show)
     facts = {"frame_rate_hz": f"{timing.frame_rate:g}", "snapshots": str(len(series.snapshots))}
     return _Specimen(series, times, _facts(series.snapshots[0]) | facts)
 
@@ -274,14 +273,6 @@ def _still(
     return _Specimen(generated.scene, times, said | {"specimen_drawn": generated.text}, generated.regions, goes_on)
 
 
-def _require_few(frames: int) -> None:
-    require(
-        frames <= MOST_FRAMES,
-        f"views and times must make at most {MOST_FRAMES} frames, but they make {frames}; take fewer of --views or "
-        "--frames.",
-    )
-
-
 def _say_of_missing_field(specimen: _Specimen, views: Views, pixel_size: float) -> None:
     missing = specimen.matter.missing_field(views)
     if specimen.goes_on:
@@ -294,15 +285,12 @@ def _say_of_missing_field(specimen: _Specimen, views: Views, pixel_size: float) 
 
 
 def _write_frames(
-    targets: list[tuple[Path, Exposures, dict[str, str]]],
-    is_test: np.ndarray,
-    frames: Iterator[np.ndarray],
-    bar: ProgressBar,
+    targets: list[tuple[Path, Exposures, dict[str, str]]], is_test: np.ndarray, frames: Iterator[np.ndarray]
 ) -> None:
     """Every frame to all `targets`, as it comes."""
     from ..io.nxtomo import scan_writer
 
-    with ExitStack() as stack:
+    with ProgressBar() as bar, ExitStack() as stack:
         writers = [stack.enter_context(scan_writer(path, e, is_test, facts)) for path, e, facts in targets]
         for n, frame in enumerate(frames):
             for add in writers:
@@ -311,7 +299,6 @@ def _write_frames(
 
 
 def _write_truth(path: Path, matter: Object, views: Views) -> None:
-    from ..geometry import Grid
     from ..io.formats import write_volume_file
 
     with ProgressBar() as bar:

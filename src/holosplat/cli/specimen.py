@@ -8,16 +8,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
+import numpy as np
 from tyro.conf import UseAppendAction, arg
 
 from ..checks import InputError, require
 from ..ranges import Grams, Many, Metres, Positive, Seed, Signed, Small, SomeShare, checked_dataclass
+from ..tables import overridden, to_table
 from .options import BeamlineOptions, MaterialOptions, MeshOptions, MotionOptions
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from ..beamline.simulate import Filling, Simulation
+    from ..matter import DeltaBeta
     from ..optics.coherence import Spectrum
     from ..scan import Exposures
     from ..specimens.carried import CarriedScene
@@ -185,11 +186,9 @@ class GeneratedOptions:
     specimen_count: Many | None = None
     """Number of cells, droplets, bubbles, threads, fibres … (default: 9, or as its kind has it)."""
     specimen_edge: Small | None = None
-    """Width of the edges of soft cells, of the head phantom and of a foam [m] (default: 3 pixels, or 4 % of the
-    extent where that is less)."""
+    """Width of the edges of soft cells, head phantom and foam [m] (default: 3 pixels, at most 4 % of the extent)."""
     specimen_radii: tuple[Small, Small] | None = None
-    """Radii of the smallest and of the largest bubble [m] (default: 5 and 14 % of the extent); the others lie evenly
-    between them."""
+    """Radii of the smallest and largest bubble [m], evenly spaced between (default: 5 and 14 % of the extent)."""
     specimen_overlap: bool = False
     """Whether bubbles may overlap, as those that merge."""
     specimen_set: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME=VALUE")] = ()
@@ -197,18 +196,15 @@ class GeneratedOptions:
     specimen_seed: Seed = 0
     """Seed of the specimen."""
     specimen_motion: float | None = None
-    """How far it goes from the first frame to the last: by how much the middle of the stirred blob turns [degrees]
-    (default: 60), or which share of its gas the collapsing foam loses (default: 0.5)."""
+    """Motion from the first frame to the last: turn of the middle of the stirred blob [degrees] (default: 60), or lost
+    share of gas of the collapsing foam (default: 0.5)."""
     core: str | None = None
-    """Formula or name of what is in coated droplets, in a cuvette or a channel, or of the absorber; --material is
-    around it."""
+    """Formula or name of what --material surrounds: in coated droplets, a cuvette, a channel, or the absorber."""
     core_density: Grams | None = None
     """Its density [g/cm³]; a named one has its own."""
 
     def timing(self, motion: MotionOptions) -> np.ndarray:
         """The times [T] of the frames [s], the first at 0; `InputError` where `motion` and the specimen do not fit."""
-        import numpy as np
-
         timing = motion.timing()
         if self.specimen not in MOVING:
             require(timing is None, "--frame-rate is of moving meshes, or of a specimen that moves; leave it out.")
@@ -229,8 +225,6 @@ class GeneratedOptions:
 
     def in_field(self, beamline: BeamlineOptions) -> AnyMatter | None:
         """The matter that may fill the field, with its parameters; None for other specimens."""
-        from ..tables import overridden
-
         kind = self._kind()
         require(
             self.specimen_motion is None or self.specimen in CARRIED,
@@ -259,13 +253,15 @@ class GeneratedOptions:
 
     def facts(self, beamline: BeamlineOptions) -> dict[str, str]:
         """What the scan file says of the specimen: its kind, seed, parameters, and what is inside."""
-        from ..tables import to_table
-
         said = {"specimen": str(self.specimen), "specimen_seed": str(self.specimen_seed)}
         if (found := self.in_field(beamline)) is None:
             return said
         parameters = {name: value for name, value in to_table(found).items() if name != "kind"}
-        shown = {name: " ".join(map(_number, v if isinstance(v, list) else [v])) for name, v in parameters.items()}
+        lists = {name: value if isinstance(value, list) else [value] for name, value in parameters.items()}
+        shown = {
+            name: " ".join(f"{one:g}" if isinstance(one, float) else str(one) for one in values)
+            for name, values in lists.items()
+        }
         core = {"core": str(self.core or found.named[1])} if found.has_core else {}
         return said | {f"specimen_{name}": text for name, text in shown.items()} | core
 
@@ -306,7 +302,7 @@ class GeneratedOptions:
         count = USUAL_COUNT if self.specimen_count is None else self.specimen_count
         edge = min(3 * pixel, 0.04 * size) if edge is None else edge
         matter = filling.of(self.specimen, beamline.energy_kev)
-        cores, goes = self._cores(filling, beamline.energy_kev), self.specimen_motion
+        core, goes = self._core(filling, beamline.energy_kev), self.specimen_motion
         if self.specimen == "stirred-blob":
             turn = math.radians(60.0 if goes is None else goes)
             return carried.stirred_blob(size, matter, seed, turn, duration)
@@ -323,22 +319,23 @@ class GeneratedOptions:
             return soft_matter.shepp_logan(size, matter, edge)
         if self.specimen == "coated-droplets":
             sizes = (0.18 * size, 0.36 * size)
-            return soft_matter.coated_droplets(count, sizes, 0.04 * size, box, (cores[0], matter), self.specimen_seed)
-        return soft_matter.body_with_absorber((size, 0.75 * size, 0.9 * size), matter, cores[0], 0.16 * size, seed)
+            return soft_matter.coated_droplets(count, sizes, 0.04 * size, box, (core, matter), seed)
+        return soft_matter.body_with_absorber((size, 0.75 * size, 0.9 * size), matter, core, 0.16 * size, seed)
 
-    def _cores(self, filling: Filling, energy_kev: float) -> list:
-        """δ and β of the core against the medium, if the kind has one."""
+    def _core(self, filling: Filling, energy_kev: float) -> DeltaBeta:
+        """δ and β of the core against the medium; of nothing where the kind has none."""
         from ..materials import parse_material
+        from ..matter import DeltaBeta
 
         cored = self.specimen in CORED
         require(cored or self.core is None, f"--core is what is inside {' and '.join(CORED)}, not {self.specimen}.")
         require(self.core is not None or self.core_density is None, "--core-density needs --core.")
         if not cored:
-            return []
+            return DeltaBeta(0.0, 0.0)
         if self.core is None:
             raise InputError(f"--specimen {self.specimen} needs --core, the material that is inside.")
         found = parse_material(self.core, self.core_density).delta_beta(energy_kev)
-        return [found.against(filling.medium.delta_beta(energy_kev)) if filling.medium else found]
+        return found.against(filling.medium.delta_beta(energy_kev)) if filling.medium else found
 
 
 @dataclass(frozen=True)
@@ -367,7 +364,3 @@ class SpecimenOptions:
             return None
         require(len(of_volume) == len(paths), "simulate takes meshes or a volume, but there are both; give one kind.")
         return self.volume.volume(paths, filling, beamline.energy_kev)
-
-
-def _number(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value)

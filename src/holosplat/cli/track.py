@@ -1,5 +1,4 @@
-"""`holosplat track | surface`: closed bodies through the times of a scan, and the options of their known shape; the
-bodies of a run as closed surfaces, fitted to its frames."""
+"""`holosplat track | surface`: closed bodies through the times of a scan, and those of a run as fitted surfaces."""
 
 from __future__ import annotations
 
@@ -32,12 +31,13 @@ from ..ranges import Metres, Seed, Share, Weight, checked_dataclass
 from ..report.run import report_run
 from ..representations import MovingSurfaces
 from ..scan import Scan
-from ..workflows.evaluate import TIMES, lines_of_times, score_object, write_times
+from ..tables import with_entries
+from ..workflows.evaluate import TIMES, Evaluation, score_object, write_times
 from ..workflows.evaluate import evaluate as score
 from ..workflows.motion_choice import may_flow
 from ..workflows.provenance import scan_hash
 from ..workflows.reconstruct import load_reconstruction
-from ..workflows.reconstruction import Reconstruction, instants_of, reconstruction_at
+from ..workflows.reconstruction import Reconstruction, instants_of
 from ..workflows.run_folder import RunFolder, claimed
 from ..workflows.track import BODIES, COLLECTION, TRACKS, begun_in_motion, reconstruct_moving
 from ..workflows.track import track as follow
@@ -45,8 +45,8 @@ from .light import LightFlags
 from .options import PriorOptions
 from .places import Output
 from .progress import ProgressBar
-from .scans import run_and_scan
-from .sentence import interruptible, put, say, tell_frames
+from .scans import report_of_middle, run_and_scan
+from .sentence import interruptible, put, say, tell_frames, tell_result
 
 
 @checked_dataclass
@@ -82,11 +82,11 @@ class MotionFlags:
     rounds: int = 4
     """How often bodies are looked for beside those that are known, at most."""
     learned: bool = True
-    """Bodies of single times are found in what the package's network guesses, where frames do not contradict it and its
-    bodies explain clearly more: red cells in two or three beams."""
+    """Find bodies of single times by the package's network, if frames do not contradict it and its bodies explain
+    clearly more (red cells in two or three beams)."""
     cells: bool = True
-    """In two beams, bodies that the network guesses are followed as red cells, too, by their shape at rest; these are
-    kept unless bodies of any shape leave clearly less of the frames."""
+    """In two beams, also follow the network's bodies as red cells of known shape; kept unless bodies of any shape fit
+    clearly better."""
     least_volume: float = 30.0
     """Bodies of fewer voxels, of a pixel's edge, are not followed."""
     volume_kept: Weight = 0.006
@@ -108,25 +108,10 @@ class MotionFlags:
 
     def options(self) -> TrackOptions:
         """The options of the method."""
+        named = {name: value for name, value in vars(self).items() if name not in ("effort", "learned", "cells")}
         usual = TrackOptions().with_effort(positive("--effort", self.effort))
-        paths = replace(usual.paths, degree=self.degree, pieces=self.pieces)
-        found = replace(usual.sightings, least_volume=self.least_volume)
-        known = {name: getattr(self, name) for name in ("volume_kept", "area_kept", "apart", "acceleration")}
-        fits = {
-            name: replace(fit, objective=replace(fit.objective, bending=self.bending), **known)
-            for name, fit in (("stiff", usual.stiff), ("soft", usual.soft), ("half", usual.half))
-        }
-        usual = usual if self.learned else replace(usual, learned=None)
-        return replace(
-            usual,
-            paths=paths,
-            sightings=found,
-            rounds=self.rounds,
-            twins=self.twins,
-            cells=self.cells,
-            intervals=self.intervals,
-            **fits,
-        )
+        usual = replace(usual, cells=self.cells, learned=usual.learned if self.learned else None)
+        return with_entries(usual, named)
 
 
 def track(
@@ -168,15 +153,19 @@ def track(
         told = {"light": illumination.options(), "folder": folder, "resume": resume, "on_progress": bar.show}
         result = follow(measured, prior, options, seed, **told)
     with claimed(folder):
-        folder.write_source(run_source(scan, reading))
-        evaluation = score(result, measured, None)
-        write_times(out / TIMES, result, measured, evaluation.light)
+        evaluation = _scored(folder, result, measured, scan, reading)
         report = report_run(folder, result, measured, evaluation, None)
     put((*evaluation.lines(), *result.choice.lines()))
-    put((*(result.verdict.lines("training frames") if result.verdict else ()), *lines_of_times(out / TIMES)))
-    seconds = sum(result.timing.values())
-    say(f"{seconds:.1f} s, {result.object.described}; report: {report}")
+    tell_result(folder, result, report)
     say(f"wrote {out / COLLECTION} ({BODIES}/), {out / TRACKS}")
+
+
+def _scored(folder: RunFolder, result: Reconstruction, measured: Scan, scan: Path, reading: Reading) -> Evaluation:
+    """Score a run of several times, and write to its folder the source of its frames and the verdict on each time."""
+    folder.write_source(run_source(scan, reading))
+    evaluation = score(result, measured, None)
+    write_times(folder.path / TIMES, result, measured, evaluation.light)
+    return evaluation
 
 
 def _cut_off(folder: RunFolder) -> str:
@@ -188,8 +177,7 @@ FEWEST_TIMES = 3
 
 
 def asks_for_motion(reading: Reading, method: Method, matter: MatterKind | None, plain: bool) -> bool:
-    """Whether --motion flow is to find motion: where the method is left to the program, matter is not said to have
-    levels, and nothing else is asked for (`plain`)."""
+    """Whether --motion flow looks for motion: nothing says the method, levels of matter, or anything else (`plain`)."""
     return reading.part.time_frame == "all" and may_flow(method, matter) and plain
 
 
@@ -207,10 +195,8 @@ def reconstruct_in_motion(
     *,
     resume: bool = False,
 ) -> bool:
-    """Find matter in motion, write its run, its report and its scores; False where nothing moves, or times are few.
-
-    how: the seed, what is assumed of the light, and how matter moves.
-    """
+    """Find matter in motion, and write its run, report and scores; False where nothing moves, or times are few. how:
+    the seed, what is assumed of the light, and how matter moves."""
     seed, light, options = how
     reading = replace(reading, part=replace(reading.part, time_frame=None))
     planned = read_frames(scan, replace(reading, told=reading.told.at_middle()))
@@ -228,32 +214,18 @@ def reconstruct_in_motion(
     if found is None:
         return _still("nothing moves, as far as the frames tell")
     result = found.reconstruction
-    folder.write_source(run_source(scan, reading))
-    evaluation = score(result, measured, None)
-    write_times(folder.path / TIMES, result, measured, evaluation.light)
+    evaluation = _scored(folder, result, measured, scan, reading)
     report = report_of_middle(folder, result, measured)
-    put((*evaluation.lines(), *(result.verdict.lines("training frames") if result.verdict else ())))
-    put(lines_of_times(folder.path / TIMES))
-    seconds = sum(result.timing.values())
+    put(evaluation.lines())
     for line in (*found.history, *(each.line for each in result.choice.decisions)):
         say(line)
-    say(f"{seconds:.1f} s, {result.object.described}; report: {report}")
+    tell_result(folder, result, report)
     return True
 
 
 def _still(why: str) -> bool:
     say(f"{why}: they are taken as of one time")
     return False
-
-
-def report_of_middle(folder: RunFolder, result: Reconstruction, measured: Scan) -> Path:
-    """The report of a run of several times at the one in the middle."""
-    times = measured.train().instants.tolist()
-    middle = len(times) // 2
-    shown = measured[(measured.exposures.time == times[middle]).nonzero()[0]].as_static()
-    now = reconstruction_at(result, times, middle)
-    whole = f"This is the time {1e6 * times[middle]:.4g} µs, of {len(measured)} frames of {len(times)} times in all."
-    return report_run(folder, now, shown, score(now, shown, None), None, whole)
 
 
 LENGTH_UNIT = "um"
@@ -312,8 +284,7 @@ def surface(
 def write_bodies(
     out: Path, bodies: Sequence[TriangleMesh], constants: Sequence[Mapping[str, float]], said: Mapping[str, Any]
 ) -> None:
-    """Write one VTK file a body (µm), and summary.json with what is `said` beside their sizes and the `constants` of
-    the matter of each."""
+    """Write one VTK file a body (µm), and summary.json of sizes, `constants` of the matter, and what is `said`."""
     one = all(each == constants[0] for each in constants)
     with atomic_folder(out) as temporary:
         for body in bodies:

@@ -13,16 +13,12 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional
 
-from ..checks import as_written, require
 from ..io.reading import Reading, Told
 from ..progress import FitProgress, FitState
 from ..ranges import Many, Within, checked_dataclass
 from .places import Output
-from .sentence import put, say
 
 if TYPE_CHECKING:
-    from ..report.compare import Side
-    from ..representations import Stored
     from ..show.server import LiveView
     from ..workflows.run_folder import RunFolder
 
@@ -92,12 +88,13 @@ def view(what: Positional[Path], port: Port = 8080) -> None:
         what: Run folder, or object file (object.h5, or one of export --compact, of a series too).
         port: Port; the next free one is taken.
     """
+    from ..show.parts import objects_of
     from ..show.server import LiveView
     from ..workflows.run_folder import RunFolder, fitted_by
 
     folder = RunFolder(what)
     followed = what.is_dir() and fitted_by(folder) is not None
-    objects, words, slider = ({}, [], "time") if followed else _objects(what)
+    objects, words, slider = ({}, [], "time") if followed else objects_of(what)
     page = LiveView(what.resolve().name or "holosplat", port)
     try:
         if followed:
@@ -134,35 +131,6 @@ def _until_interrupted() -> None:
     threading.Event().wait()
 
 
-def _objects(what: Path) -> tuple[dict[str, Stored], list[str], str]:
-    """What a slider leads through, by its label: times, or a rehearsed run and its likely matter; words on it; and the
-    slider's name."""
-    from ..io.compact import SERIES
-    from ..io.hdf5 import open_hdf5
-    from ..io.objects import read_object, read_series
-    from ..show.parts import at_times, likely_surfaces
-    from ..show.scene import steps_of
-    from ..workflows.reconstruction import instants_of
-    from ..workflows.rehearsal import matter_of
-    from ..workflows.run_folder import RunFolder
-
-    require(what.exists(), f"{what} must be a run folder or an object file, but there is none; check the path.")
-    if what.is_dir():
-        folder = RunFolder(what)
-        folder.require_run()
-        obj, matter = folder.read_result(), matter_of(folder)
-        likely = {} if matter is None else likely_surfaces(matter)
-        words, slider = [obj.described, *steps_of(folder)], "shown" if likely else "time"
-        return at_times(obj, instants_of(folder)) | likely, words, slider
-    with open_hdf5(what) as file:
-        several = file.attrs.get("format", "") == SERIES
-    if several:
-        series = read_series(what)
-        return series, [f"{len(series)} objects"], "time"
-    obj = read_object(what)
-    return at_times(obj, ()), [obj.described], "time"
-
-
 def compare(
     a: Positional[Path], b: Positional[Path], out: Output = Path("compare.html"), allow_external: bool = False
 ) -> None:
@@ -177,32 +145,16 @@ def compare(
         allow_external: Follow links of the runs' scans to other files; only of files you trust.
     """
     from ..report.compare import Comparison, in_columns, write_comparison
+    from .scans import side_of_run
 
     for path in (a, b):
         Told(allow_external=allow_external).vouch(path)
-    comparison = Comparison(_side(a), _side(b))
+    comparison = Comparison(side_of_run(a), side_of_run(b))
     for table in (*comparison.found(), *comparison.asked()):
         print("\n".join(in_columns(table)))
     print(comparison.verdict())
     write_comparison(comparison, out)
     print(f"page: {out}")
-
-
-def _side(path: Path) -> Side:
-    """A run with its scores, as far as its scan is still there."""
-    from ..io.atomic import read_json
-    from ..io.reading import Part, Reading
-    from ..report.compare import side_of
-    from ..workflows.reconstruction import instants_of
-    from ..workflows.run_folder import RunFolder
-    from .scans import scan_for
-
-    folder, scan = RunFolder(path), None
-    folder.require_run()
-    told = read_json(folder.source).get("scan") if folder.source.is_file() else None
-    if told and Path(str(told)).exists():
-        scan = scan_for(folder, None, Reading(part=Part(time_frame=0)) if instants_of(folder) else Reading())
-    return side_of(folder, scan)
 
 
 def rehearse(run: Positional[Path], times: Many = 8, bins: Many | None = None, reading: Reading = Reading()) -> None:
@@ -216,47 +168,6 @@ def rehearse(run: Positional[Path], times: Many = 8, bins: Many | None = None, r
         times: Rehearsals, 2 or more.
         bins: Pixels joined along an edge, for speed (default: to about 48 pixels along the shorter side).
     """
-    from ..series.collect import collect
-    from ..series.folder import SeriesFolder
-    from ..workflows.run_folder import RunFolder
-    from .scans import runs_of
+    from .scans import rehearse_each
 
-    each = runs_of(run)
-    for number, (_, folder) in enumerate(each):
-        if folder.result().is_file():
-            say(f"time {number}:")
-            _rehearse(folder, times, bins, reading)
-    if each:
-        collect(series := SeriesFolder(run))
-        say(f"wrote {series.table}")
-    else:
-        _rehearse(RunFolder(run), times, bins, reading)
-
-
-def _rehearse(folder: RunFolder, times: int, bins: int | None, reading: Reading) -> None:
-    from ..methods.continued import Continued
-    from ..methods.presets import method_of
-    from ..methods.solve import Settled
-    from ..report.run import report_run
-    from ..series.plan import prior_of
-    from ..tables import from_table
-    from ..workflows.evaluate import evaluate as score
-    from ..workflows.rehearsal import rehearse as repeat
-    from ..workflows.run_folder import claimed
-    from .progress import ProgressBar
-    from .scans import run_and_scan
-
-    result, measured = run_and_scan(folder, None, reading)
-    config = folder.read_config()
-    with as_written(folder.config, "what reconstruct wrote"):
-        told = dict(config["method"])
-        method = from_table(Continued, told) if told.get("kind") == Continued.kind else method_of(told, "method")
-        method = Settled.again(method, config["decided"]).method
-        prior, seed = prior_of(config["prior"]), int(config["seed"])
-    with claimed(folder):
-        with ProgressBar() as bar:
-            how = {"times": times, "bins": bins, "seed": seed, "folder": folder, "on_progress": bar.show}
-            found = repeat(result, measured, prior, method, **how)
-        page = report_run(folder, result, measured, score(result, measured, None), None)
-    put(found.lines())
-    say(f"report: {page}")
+    rehearse_each(run, times, bins, reading)

@@ -1,7 +1,4 @@
-"""Files: one module a format. Readers check what they read; writers replace a file whole or not at all.
-
-`read` opens a scan of any format.
-"""
+"""Files: one module a format. Readers check what they read; writers replace a file whole or not at all."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""The order in which the frames of numbered files follow each other, and their angles: read from text files, and said
-of the views that come of them."""
+"""The order of frames in numbered files, their angles in text files, and warnings of odd angles."""
 
 from __future__ import annotations
 
@@ -48,7 +47,8 @@ def in_order(files: Sequence[Path]) -> list[Path]:
     files = sorted(files)
     names = [file.stem.lower() for file in files]
     split = _split([_dated(name) for name in names])
-    order = sorted(range(len(files)), key=lambda i: _by_words(*split[i]))
+    in_turn = [[part for pair in zip(words, (*numbers, Decimal(0))) for part in pair] for words, numbers in split]
+    order = sorted(range(len(files)), key=in_turn.__getitem__)
     for one, other in pairwise(order):
         if split[one] == split[other]:
             raise InputError(
@@ -58,7 +58,15 @@ def in_order(files: Sequence[Path]) -> list[Path]:
             )
     if len({words for words, _ in split}) > 1:
         _require_decimal(files, names, order)
-        _tell_series(files, [split[i][0] for i in order], order)
+        counts = Counter(split[i][0] for i in order)
+        if len(counts) < len(files):  # some are numbered: they may be of several series, copies, or none of the frames
+            firsts = {split[i][0]: files[i].name for i in reversed(order)}
+            named = ", ".join(f"{count} as {firsts[kind]}" for kind, count in [*counts.items()][:NAMED])
+            more = f" and others of {len(counts) - NAMED} kinds" if len(counts) > NAMED else ""
+            warn(
+                f"{files[0].parent} has files of different names, {named}{more}; they are taken for one series in this "
+                "order. If they are not, choose the frames' names by --files, or take the others out"
+            )
         return [files[i] for i in order]
     columns = [column for column in zip(*(numbers for _, numbers in split)) if len(set(column)) > 1]
     counting = [column for column in columns if len(set(column)) == len(column)]
@@ -98,28 +106,9 @@ def _require_decimal(files: Sequence[Path], names: Sequence[str], order: Sequenc
     )
 
 
-def _tell_series(files: Sequence[Path], words: Sequence[Words], order: Sequence[int]) -> None:
-    """Warn of files that differ in the words of their names [N], in this order, of which some are numbered: they may be
-    of several series, copies, or none of the frames."""
-    counts = Counter(words)
-    if len(counts) < len(words):
-        firsts = [(files[order[words.index(kind)]].name, count) for kind, count in counts.items()]
-        named = ", ".join(f"{count} as {name}" for name, count in firsts[:NAMED])
-        more = f" and others of {len(firsts) - NAMED} kinds" if len(firsts) > NAMED else ""
-        warn(
-            f"{files[0].parent} has files of different names, {named}{more}; they are taken for one series in this "
-            "order. If they are not, choose the frames' names by --files, or take the others out"
-        )
-
-
 def _shared(names: Sequence[str]) -> int:
     """The number of characters with which all names begin."""
     return next((n for n, letters in enumerate(zip(*names)) if len(set(letters)) > 1), min(map(len, names)))
-
-
-def _by_words(words: Words, numbers: Numbers) -> list[str | Decimal]:
-    """Words and numbers of a name in turn."""
-    return [part for pair in zip(words, (*numbers, Decimal(0))) for part in pair]
 
 
 def _split(names: Sequence[str]) -> list[tuple[Words, Numbers]]:
@@ -138,12 +127,12 @@ def _split(names: Sequence[str]) -> list[tuple[Words, Numbers]]:
     number = r"\d+(?:\.\d+)?(?:e[-+]\d+)?" if decimal else r"\d+"
     minus = "-+\N{MINUS SIGN}"
     ways = (rf"(?<![a-z0-9])[{minus}]{number}|{number}", rf"[{minus}]?{number}", rf"(?:(?<![a-z0-9])[mp])?{number}")
-    split = [[_parted(name, way) for name in names] for way in ways]
+
+    def parted(name: str, number: str) -> tuple[Words, Numbers]:
+        return tuple(re.split(number, name)), tuple(Decimal(text.translate(SIGNS)) for text in re.findall(number, name))
+
+    split = [[parted(name, way) for name in names] for way in ways]
     return next((way for way in split if len({words for words, _ in way}) == 1), split[0])
-
-
-def _parted(name: str, number: str) -> tuple[Words, Numbers]:
-    return tuple(re.split(number, name)), tuple(Decimal(text.translate(SIGNS)) for text in re.findall(number, name))
 
 
 UNIT = re.compile(rf"(?<![a-z])({'|'.join(sorted(ANGLE_UNITS, key=len, reverse=True))})s?(?![a-z])", re.IGNORECASE)
@@ -182,7 +171,9 @@ def read_angles(path: Path) -> np.ndarray:
     """
     require_regular(path, "a text file of angles (--angles)")
     lines = [line.partition("#") for line in _text(path).splitlines()]
-    decimal = {";": ",", "\t": ","}.get(separator := _separator(lines), "")
+    bare = [line.strip().rstrip(";,") for line, *_ in lines]
+    separator = next((one for one in ";\t" if 2 * sum(one in line for line in bare) > len(lines)), ",")  # as most have
+    decimal = {";": ",", "\t": ","}.get(separator, "")
     rows = [row for row in (_cells(line, separator, decimal) for line, *_ in lines) if row]
     said = " ".join(comment for *_, comment in lines)
     words, header = _angle_words(path, rows)
@@ -190,7 +181,10 @@ def read_angles(path: Path) -> np.ndarray:
     parts = [(found[1], found[2]) if (found := WITH_UNIT.fullmatch(word)) else (word, "") for word in words]
     units = {unit for _, unit in parts}
     require(len(units) == 1, f"{path} must hold angles of one unit, but it holds several; {ADVICE}.")
-    values = finite(f"{path}: angles", np.array([_number(path, word) for word, _ in parts]))
+    values = np.array([number_in(word) for word, _ in parts])
+    for word, _ in (part for part, value in zip(parts, values) if math.isnan(value)):
+        raise InputError(f"{path} must hold angles in degrees, but it holds {shown(word)}; {ADVICE}.")
+    values = finite(f"{path}: angles", values)
     if unit := UNIT.search(f"{units.pop()} {header} {said}".replace("_", " ")):
         return values * (unit_factor(f"{path}: angles", unit[1], ANGLE_UNITS) / ANGLE_UNITS["deg"])
     if unknown := BRACKETED.search(header):
@@ -199,8 +193,8 @@ def read_angles(path: Path) -> np.ndarray:
 
 
 def degrees(label: str, values: np.ndarray, where: str) -> np.ndarray:
-    """The angles [N], which come without a unit, as degrees. Errors: `InputError` that says `where` the unit is to be
-    said, for those that cover a half or a whole turn of radians."""
+    """The angles [N] without a unit, as degrees; `InputError` that says `where` to write the unit, for those that cover
+    a half or a whole turn of radians."""
     if values.size >= FEW // 2:
         reach = np.ptp(values) * np.array([[1.0], [values.size / (values.size - 1)]])
         require(
@@ -227,14 +221,6 @@ def _text(path: Path) -> str:
         raise InputError(f"--angles must be a text file of angles, but reading {path} failed: {error}.") from None
     alone = LIST.fullmatch(text)
     return (alone[1].replace("\n", " ") if alone else text).replace("\N{MINUS SIGN}", "-")
-
-
-def _separator(lines: list[tuple[str, str, str]]) -> str:
-    """What stands between the entries of a line: a semicolon or tab where most have one, else commas."""
-    for separator in ";\t":
-        if 2 * sum(separator in line.strip().rstrip(";,") for line, *_ in lines) > len(lines):
-            return separator
-    return ","
 
 
 def _cells(line: str, separator: str, decimal: str) -> list[str]:
@@ -279,26 +265,14 @@ def _angle_words(path: Path, rows: list[list[str]]) -> tuple[list[str], str]:
     named = [n for n, name in enumerate(header) if NAME.search(name)]
     if len(named) == 1 and all(len(row) == len(header) for row in body):
         frames = [n for n, name in enumerate(header) if name and ORDER.fullmatch(name)]
-        body = _by_frames(body, frames[0]) if len(frames) == 1 else body
+        order = [Path(row[frames[0]]) for row in body] if len(frames) == 1 else []
+        if len(set(order)) == len(body):  # rows say of which frame they are
+            body = [body[order.index(name)] for name in in_order(order)]
         return [row[named[0]] for row in body], f"{header[named[0]]} {units[named[0]]}"
     raise InputError(
         f"{path} must hold one angle a line, or a table with a header that names one column 'angle', but a line holds "
         f"{max(map(len, rows))} numbers; {ADVICE}, with a point before the decimals."
     )
-
-
-def _by_frames(rows: list[list[str]], column: int) -> list[list[str]]:
-    """Rows of a table in the order of the frames that their entries in `column` number or name."""
-    names = [Path(row[column]) for row in rows]
-    if len(set(names)) < len(rows):
-        return rows
-    return [rows[names.index(name)] for name in in_order(names)]
-
-
-def _number(path: Path, word: str) -> float:
-    number = number_in(word)
-    require(not math.isnan(number), f"{path} must hold angles in degrees, but it holds {shown(word)}; {ADVICE}.")
-    return number
 
 
 def angles_of(views: Views) -> np.ndarray | None:
@@ -346,8 +320,7 @@ def tell_views(scan: Scan) -> None:
 
 
 def _repeated(angles: np.ndarray) -> np.ndarray:
-    """The angles [degrees] that several frames of `angles` [N] have, once for each frame too many; a whole turn may end
-    where it began."""
+    """The repeated ones of `angles` [N] [degrees], once for each frame too many; a turn may end where it began."""
     order = np.argsort(angles % WHOLE_TURN, kind="stable")
     sides = np.append(angles[order] % WHOLE_TURN, angles[order[0]] % WHOLE_TURN + WHOLE_TURN)
     pairs = zip(order, np.append(order[1:], order[0]), np.diff(sides) < SAME_DEG)

@@ -26,8 +26,8 @@ from ..units import ANGLE_UNITS, ENERGY_UNITS, LENGTH_UNITS
 from .angles import degrees
 from .guard import read_archive
 from .hdf5 import Fields, open_hdf5
-from .raw_file import DARK, FLAT, NOTHING, PROJECTION, RANGES, RAW_TAKES, Loader, ScanFile, Stack
-from .stored_frames import reader
+from .raw_file import DARK, FLAT, NOTHING, PROJECTION, RANGES, ScanFile, Stack
+from .stored_frames import raw_loader
 
 FRAMES = ("counts", "projections", "proj", "data")
 FLATS = ("flats", "flat", "white")
@@ -38,25 +38,22 @@ NAMES = (*FRAMES, *FLATS, *DARKS, *ANGLES, *RANGES)
 
 @contextmanager
 def open_arrays(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Iterator[ScanFile]:
-    """An archive or HDF5 file of plain arrays, checked except for its frames.
-
-    given: values that go before the file's, by name (`TAKES`). Errors: `InputError` for a damaged file, and for values
-    that neither say, with the option that says them.
-    """
+    """An archive or HDF5 file of plain arrays, checked except for its frames; `given` and errors as of `open_scan`."""
     source = Path(path)
     with _arrays(source) as arrays:
         frames, flats, darks, angles = (_first(arrays, names) for names in (FRAMES, FLATS, DARKS, ANGLES))
         parts = [(PROJECTION, _stack(frames)), (FLAT, _stack(flats)), (DARK, _stack(darks))]
-        found: dict[str, Any] = {} if angles is None else {"angles_deg": _in_degrees(arrays, path)}
-        found |= {name: _one_number(f"{path}: {name}", arrays[name]) for name in RANGES if name in arrays}
+        found: dict[str, Any] = {}
+        for name in (name for name in RANGES if name in arrays):
+            count = arrays[name].size
+            require(count == 1, f"{path}: {name} must be one number, but there are {count}; keep one.")
+            found[name] = float(arrays[name][()].reshape(-1)[0])
+        if angles is not None:
+            name = next(name for name in ANGLES if name in arrays)
+            found["angles_deg"] = finite(f"{path}: {name}", np.asarray(angles, dtype=np.float64).reshape(-1))
+            if "deg" not in name:
+                degrees(f"{path}: {name}", found["angles_deg"], f"by the name of the array, {ANGLES[0]}")
         yield ScanFile.of(source, parts, given, found)
-
-
-def _in_degrees(arrays: Mapping[str, Any], path: str | Path) -> np.ndarray:
-    """The angles [N] of an array whose name may say their unit."""
-    name = next(name for name in ANGLES if name in arrays)
-    values = finite(f"{path}: {name}", np.asarray(arrays[name], dtype=np.float64).reshape(-1))
-    return values if "deg" in name else degrees(f"{path}: {name}", values, f"by the name of the array, {ANGLES[0]}")
 
 
 @contextmanager
@@ -82,11 +79,6 @@ def _first(arrays: Mapping[str, Any], names: tuple[str, ...]) -> Any:
     return next((arrays[name] for name in names if name in arrays), None)
 
 
-def _one_number(label: str, array: Any) -> float:
-    require(array.size == 1, f"{label} must be one number, but there are {array.size}; keep one.")
-    return float(array[()].reshape(-1)[0])
-
-
 def _stack(frames: Any) -> Stack | None:
     """Frames [n, H, W]; a single frame [H, W] is read and becomes one of them."""
     if frames is None or len(frames.shape) != 2:
@@ -107,10 +99,8 @@ def _holds_arrays(path: Path) -> bool:
         return any(f"{name}.npy" in archive.namelist() for name in FRAMES)
 
 
-LOADER = Loader(
-    *("arrays", f"a NumPy archive (.npz) or an HDF5 file with the array {FRAMES[0]}", _holds_arrays),
-    *(reader(open_arrays), RAW_TAKES, open_arrays),
-)
+MARK = f"a NumPy archive (.npz) or an HDF5 file with the array {FRAMES[0]}"
+LOADER = raw_loader("arrays", MARK, _holds_arrays, open_arrays)
 
 
 DATA, WHITE, BLACK, THETA = (f"exchange/{name}" for name in ("data", "data_white", "data_dark", "theta"))
@@ -127,11 +117,7 @@ PIXEL_SIZES = (
 
 @contextmanager
 def open_exchange(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Iterator[ScanFile]:
-    """A data-exchange file, checked except for its frames.
-
-    given: values that go before the file's, by name (`TAKES`). Errors: `InputError` names the file, the dataset, and
-    the option that says what is missing.
-    """
+    """A data-exchange file, checked except for its frames; `given` and errors as of `open_scan`."""
     with open_hdf5(path) as file:
         fields = Fields(Path(path), file)
         parts = [(kind, _frames(fields, name)) for kind, name in STACKS]
@@ -179,6 +165,4 @@ def _is_exchange(path: Path) -> bool:
         return isinstance(file.get(DATA), h5py.Dataset)
 
 
-EXCHANGE = Loader(
-    *("data-exchange", f"an HDF5 file with /{DATA}", _is_exchange, reader(open_exchange), RAW_TAKES, open_exchange)
-)
+EXCHANGE = raw_loader("data-exchange", f"an HDF5 file with /{DATA}", _is_exchange, open_exchange)

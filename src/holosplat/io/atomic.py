@@ -14,7 +14,7 @@ from typing import Any
 
 from ..checks import InputError, require
 from ..tables import read_table
-from .leftovers import clear_leftovers, flushed, flushed_tree, is_begun, temporary_name
+from .lock import clear_leftovers, flushed, flushed_tree, is_begun, require_parent, temporary_name
 from .provenance import leave_record, require_free
 
 
@@ -92,18 +92,10 @@ def require_new(path: str | Path, way_out: str = "choose another name, or remove
     require_parent(path)
 
 
-def require_parent(path: str | Path) -> None:
-    """`InputError` unless `path` lies in an existing folder."""
-    parent = Path(os.path.realpath(path)).parent
-    require(parent.is_dir(), f"{path} must lie in an existing folder, but {parent} is none; create it.")
-
-
 @contextmanager
 def atomic_folder(path: str | Path) -> Iterator[Path]:
-    """A temporary folder beside `path` to write into; it becomes `path`, which must be new, when the block ends well.
-
-    If the block raises, the temporary folder goes; a failure of the file system becomes an `InputError`.
-    """
+    """A temporary folder beside `path`, which must be new; it becomes `path` when the block ends well, and goes when it
+    raises. Errors: `InputError` for a failure of the file system."""
     require_new(path)
     target = Path(path).resolve()
     clear_leftovers(target)

@@ -145,11 +145,19 @@ class Beams:
         return scan.taken(self.on(scan.exposures))
 
     def on(self, planned: Exposures) -> Exposures:
-        """These exposures in the place of those `planned`: one a frame, or one a frame of every time.
-
-        Errors: `InputError` for another number of frames.
-        """
-        index = self._index(planned.time)
+        """These exposures in place of those `planned`, one a frame, or a frame of every time; `InputError` for another
+        number."""
+        index, times = np.arange(len(self)), planned.time
+        if len(times) != len(self):
+            index = np.zeros(len(times), dtype=int)
+            for time in np.unique(times):
+                at = np.flatnonzero(times == time)
+                require(
+                    len(at) == len(self),
+                    f"the geometry must have a view for each of the {len(times)} frames, or for each of the {len(at)} "
+                    f"of every time, but it has {len(self)}; take that of this scan.",
+                )
+                index[at] = np.arange(len(self))
         pixels, metres, in_pixels = (self.said(name) for name in ("pixel_size_m", "shift_m", "shift_px"))
         sizes = planned.views.pixel_sizes if pixels is None else pixels[index]
         rotations = np.array([each.matrix() for each in self.view])[index]
@@ -165,22 +173,6 @@ class Beams:
             distance=planned.distance if distance is None else distance[index],
             energy_kev=planned.energy_kev if energy is None else energy[index],
         )
-
-    def _index(self, times: np.ndarray) -> np.ndarray:
-        """[N] which view each frame is, taken at `times` [N]."""
-        count = len(self)
-        if len(times) == count:
-            return np.arange(count)
-        found = np.zeros(len(times), dtype=int)
-        for time in np.unique(times):
-            at = np.flatnonzero(times == time)
-            require(
-                len(at) == count,
-                f"the geometry must have a view for each of the {len(times)} frames, or for each of the {len(at)} of "
-                f"every time, but it has {count}; take that of this scan.",
-            )
-            found[at] = np.arange(count)
-        return found
 
     def text(self) -> str:
         """The file's content."""

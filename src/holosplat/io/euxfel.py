@@ -35,11 +35,8 @@ TRAIN_INTERVAL_S = 0.1
 
 @dataclass(frozen=True)
 class KeyStack:
-    """The frames [n, H, W] of one camera of a run, those of a train one after another.
-
-    places: train's identity and the pulse in it, of each frame; is_marked: whether masks of its pixels (`MASK`) are
-    there, too.
-    """
+    """The frames [n, H, W] of one camera, those of a train one after another; places: train and pulse of each frame;
+    is_marked: whether the run has masks of its pixels (`MASK`)."""
 
     path: Path
     source: str
@@ -141,49 +138,40 @@ def open_euxfel(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Iterato
 
 def _cameras(path: Path, given: Mapping[str, Any]) -> tuple[KeyStack, ...]:
     """A stack for each camera that is wanted, of the trains that all of them have."""
+    wanted = [word.strip() for word in str(given.get("sources") or SOURCES).split(",")]
     with as_written(path, RUN):
-        return _stacks(path, given)
-
-
-def _stacks(path: Path, given: Mapping[str, Any]) -> tuple[KeyStack, ...]:
-    run, wanted = _run(str(path)), [word.strip() for word in str(given.get("sources") or SOURCES).split(",")]
-    having = [source for source in sorted(run.instrument_sources) if PIXELS in run.keys_for_source(source)]
-    names = [source for source in having if any(fnmatch(source, f"*{word}*") for word in wanted)]
-    require(
-        len(names) > 0,
-        f"{path} must have cameras named {', '.join(wanted)}, but those with {PIXELS} are "
-        f"{', '.join(having) or 'none'}; name them by --sources.",
-    )
-    trains = _trains(path, run, names, given.get("trains"))
-    entry = [run[name, PIXELS].entry_shape for name in names]
-    require(
-        len(entry[0]) in (2, 3) and all(shape == entry[0] for shape in entry),
-        f"{path}: all cameras must have the same frames, [pulses, rows, columns], but theirs are "
-        f"{', '.join(str(tuple(shape)) for shape in entry)}; take one by --sources.",
-    )
-    kinds = {np.dtype(run[name, PIXELS].dtype) for name in names}
-    numbers = all(kind.kind in "iuf" for kind in kinds) and 0 not in entry[0]
-    require(numbers, f"{path}: {PIXELS} must hold numbers, but holds {', '.join(map(str, kinds))} {tuple(entry[0])}.")
-    count = 1 if len(entry[0]) == 2 else entry[0][0]
-    pulses = np.flatnonzero(marked("--pulses", given.get("pulses") or ":", count))
-    places = tuple((int(train), int(pulse)) for train in trains for pulse in pulses)
-    shape = (len(places), *entry[0][-2:])
-    masks = [MASK in run.keys_for_source(name) and run[name, MASK].entry_shape == entry[0] for name in names]
-    return tuple(KeyStack(path, name, places, shape, has) for name, has in zip(names, masks))
+        run = _run(str(path))
+        having = [source for source in sorted(run.instrument_sources) if PIXELS in run.keys_for_source(source)]
+        names = [source for source in having if any(fnmatch(source, f"*{word}*") for word in wanted)]
+        require(
+            len(names) > 0,
+            f"{path} must have cameras named {', '.join(wanted)}, but those with {PIXELS} are "
+            f"{', '.join(having) or 'none'}; name them by --sources.",
+        )
+        trains = _trains(path, run, names, given.get("trains"))
+        entry = [run[name, PIXELS].entry_shape for name in names]
+        require(
+            len(entry[0]) in (2, 3) and all(shape == entry[0] for shape in entry),
+            f"{path}: all cameras must have the same frames, [pulses, rows, columns], but theirs are "
+            f"{', '.join(str(tuple(shape)) for shape in entry)}; take one by --sources.",
+        )
+        kinds = {np.dtype(run[name, PIXELS].dtype) for name in names}
+        require(
+            all(kind.kind in "iuf" for kind in kinds) and 0 not in entry[0],
+            f"{path}: {PIXELS} must hold numbers, but holds {', '.join(map(str, kinds))} {tuple(entry[0])}.",
+        )
+        count = 1 if len(entry[0]) == 2 else entry[0][0]
+        pulses = np.flatnonzero(marked("--pulses", given.get("pulses") or ":", count))
+        places = tuple((int(train), int(pulse)) for train in trains for pulse in pulses)
+        shape = (len(places), *entry[0][-2:])
+        masks = [MASK in run.keys_for_source(name) and run[name, MASK].entry_shape == entry[0] for name in names]
+        return tuple(KeyStack(path, name, places, shape, has) for name, has in zip(names, masks))
 
 
 def _trains(path: Path, run: Any, names: list[str], wanted: str | None) -> np.ndarray:
-    """The trains' identities, of those of which all cameras have frames, in their order."""
+    """The trains of which all cameras have frames, in their order, with a warning of lost ones between them."""
     having = [set(run[name, PIXELS].drop_empty_trains().train_ids) for name in names]
-    common = set.intersection(*having)
-    _tell_lost(path, common, set(run.train_ids).union(*having))
-    require(len(common) > 0, f"{path} has no train of which all of {', '.join(names)} have frames; name others.")
-    trains = np.array(sorted(common), dtype=np.int64)
-    return trains[marked("--trains", wanted or ":", len(trains))]
-
-
-def _tell_lost(path: Path, common: set[int], known: set[int]) -> None:
-    """Warn of trains of which some camera has no frames, and of those that no file has, between the others."""
+    common, known = set.intersection(*having), set(run.train_ids).union(*having)
     every = min(np.diff(sorted(known)), default=1)
     lost = sorted((known | set(range(min(known, default=0), max(known, default=0), int(every)))) - common)
     if lost and common:
@@ -191,6 +179,9 @@ def _tell_lost(path: Path, common: set[int], known: set[int]) -> None:
         warn(
             f"{path}: {len(lost)} of {len(lost) + len(common)} trains are lost, for not all cameras have them: {shown}"
         )
+    require(len(common) > 0, f"{path} has no train of which all of {', '.join(names)} have frames; name others.")
+    trains = np.array(sorted(common), dtype=np.int64)
+    return trains[marked("--trains", wanted or ":", len(trains))]
 
 
 def _times(stack: KeyStack, given: Mapping[str, Any]) -> np.ndarray:

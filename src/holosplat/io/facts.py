@@ -37,8 +37,7 @@ UNIT, UNIT_M = "um", 1e-6
 
 @dataclass(frozen=True)
 class Facts:
-    """rows: facts by name; missing: a sentence for each thing that neither the path nor an option says; commands: what
-    can be done next."""
+    """rows: facts by name; missing: a sentence for each thing that nothing says; commands: what can be done next."""
 
     rows: Mapping[str, str]
     missing: tuple[str, ...] = ()
@@ -61,13 +60,21 @@ def facts_of_matter(path: Path) -> Facts | None:
         found = ome_grid(path)
         return None if found is None else Facts(_of_grid("OME-TIFF", *found))
     if path.suffix.lower() in FORMATS and path.suffix.lower() not in HDF5_SUFFIXES:
-        return _of_read(path)
+        stored = volume_format(path).read(path)
+        rows = _of_grid(path.suffix[1:].upper(), stored.grid, stored.of)
+        for values, (name, unit) in zip(stored.arrays, stored.of.units.items()):
+            rows[SYMBOLS[name]] = f"{values.min():.3g} to {values.max():.3g}{' m⁻¹' * (unit != '1')}"
+        return Facts(rows)
     if not (path.is_file() and h5py.is_hdf5(path)):
         return None
     with open_hdf5(path) as file:
         form = attribute_text(file.attrs.get("format")) or ""
         if OBJECT.fullmatch(form):
-            return _of_object(path, file, form)
+            from ..representations import KINDS
+
+            kind = attribute_text(file.attrs.get("kind")) or "gaussians"
+            known = KINDS[kind].__name__ if kind in KINDS else kind
+            return Facts({"what": f"an object ({form}): {known}"}, (), (f"holosplat view {path}",))
         for of in (REFRACTION, ABSORPTION):
             if all(isinstance(file.get(name), h5py.Dataset) for name in of.units):
                 return _of_volume(path, file, of)
@@ -122,15 +129,6 @@ def _of_volume(path: Path, file: h5py.File, of: Contents) -> Facts:
     return Facts(rows, () if sizes else (unsaid,), (command,))
 
 
-def _of_object(path: Path, file: h5py.File, form: str) -> Facts:
-    from ..representations import KINDS
-
-    kind = attribute_text(file.attrs.get("kind")) or "gaussians"
-    known = KINDS[kind].__name__ if kind in KINDS else kind
-    rows = {"what": f"an object ({form}): {known}"}
-    return Facts(rows, (), (f"holosplat view {path}",))
-
-
 def _of_mesh(path: Path) -> Facts:
     """A mesh, or the first one of a folder of them, in the unit of its file."""
     files = mesh_files(path)
@@ -155,15 +153,6 @@ def _of_grid(form: str, grid: Grid, of: Contents) -> dict[str, str]:
     shape = " × ".join(map(str, grid.shape))
     what = f"a volume of {' and '.join(SYMBOLS[name] for name in of.units)} ({form})"
     return {"what": what, "shape": f"{shape} voxels (z, y, x)", "voxels": f"{size} µm"}
-
-
-def _of_read(path: Path) -> Facts:
-    """A volume whose format is known by its suffix, read as a whole."""
-    stored = volume_format(path).read(path)
-    rows = _of_grid(path.suffix[1:].upper(), stored.grid, stored.of)
-    for values, (name, unit) in zip(stored.arrays, stored.of.units.items()):
-        rows[SYMBOLS[name]] = f"{values.min():.3g} to {values.max():.3g}{' m⁻¹' * (unit != '1')}"
-    return Facts(rows)
 
 
 def _of_zarr(path: Path) -> Facts | None:

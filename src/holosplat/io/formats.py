@@ -10,13 +10,13 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from ..checks import InputError, finite, in_range, require
-from ..frames import Frames
 from ..geometry import Grid
 from ..matter import DeltaBeta
 from ..progress import Advance
@@ -29,7 +29,7 @@ from .hdf5 import open_hdf5
 from .hdf5_guard import is_vouched
 from .ome import TIFF_SUFFIXES, ZARR_SUFFIX, read_ome_tiff, read_ome_zarr, require_zarr, write_ome_tiff, write_ome_zarr
 from .paraview import read_vti, write_vti
-from .plain_values import both, read_mrc, read_nrrd, write_mrc, write_nrrd
+from .plain_values import both, read_both, read_mrc, read_nrrd, write_mrc, write_nrrd
 from .raw_file import Loader, ScanFile, folder_with
 from .reading import Reading
 from .stacks import all_images
@@ -41,11 +41,8 @@ SOURCE, SUMMARY = "source.json", "summary.json"
 
 
 def run_reading(path: str | Path) -> Reading:
-    """How the run folder `path` read its scan; `InputError` for a source.json that is damaged.
-
-    Whether the scan may bring values of other files, the folder does not decide: it is as whoever reads it allows
-    (`Told.vouch`).
-    """
+    """How the run folder `path` read its scan, with --allow-external only as the reader allows it (`Told.vouch`);
+    `InputError` for a damaged source.json."""
     table = Table.read(Path(path) / SOURCE)
     time_frame = table.values.get("time_frame")
     known = time_frame is None or time_frame in ("all", "still") or isinstance(time_frame, int)
@@ -61,20 +58,13 @@ def run_source(scan: Path, reading: Reading) -> dict[str, object]:
 
 
 def read_run_scan(path: str | Path) -> Scan:
-    """The scan of the run folder `path`, read as the run read it: its frames of the time that the run is of, too.
-
-    Where the run refined the geometry, its frames are where it found them. Errors: `InputError` when the scan is no
-    longer there or cannot be read.
-    """
+    """The scan of the run folder `path`, read as the run read it, with the geometry that it refined. Errors:
+    `InputError` when the scan is gone or cannot be read."""
     table = Table.read(Path(path) / SOURCE)
-    scan = Path(table.text("scan"))
-    there = scan.exists() and scan.resolve() != Path(path).resolve()
-    require(there, f"{table.label('scan')} must name the run's scan, but {scan} is not there or none; name another.")
-    return _where_found(Path(path) / SUMMARY, read_as(scan, run_reading(path)))
-
-
-def _where_found(summary: Path, scan: Scan) -> Scan:
-    """`scan` with the exposures that `summary` has, if the run found any; errors: `InputError` for other frames."""
+    source, summary = Path(table.text("scan")), Path(path) / SUMMARY
+    there = source.exists() and source.resolve() != Path(path).resolve()
+    require(there, f"{table.label('scan')} must name the run's scan, but {source} is not there or none; name another.")
+    scan = read_as(source, run_reading(path))
     found = Table.read(summary).values.get("geometry") if summary.is_file() else None
     if found is None:
         return scan
@@ -142,16 +132,13 @@ def read(path: str | Path, given: Mapping[str, Any] | None = None) -> Scan:
 
 
 def read_as(path: str | Path, reading: Reading, joined: bool = True) -> Scan:
-    """The scan at `path`, as `read`, with what is said of it beside its files, and cut to the part that is taken.
-
-    joined: as of `Reading.applied`.
-    """
+    """The scan at `path`, as `read`, with the metadata and the part of `reading`; joined: as of `Reading.applied`."""
     return _read(path, reading, False, joined)
 
 
 def read_frames(path: str | Path, reading: Reading, joined: bool = True) -> Scan:
-    """The scan at `path`, as `read_as`, for those who take the logarithm of its frames or compare with them: pixels
-    that are not above 0 are missing, and their number is said."""
+    """The scan of `read_as`, for those who take the logarithm of its frames: pixels that are not above 0 are missing,
+    and their number is said."""
     return _read(path, reading, True, joined)
 
 
@@ -159,17 +146,15 @@ def _read(path: str | Path, reading: Reading, mended: bool, joined: bool) -> Sca
     reading.told.vouch(Path(path))
     scan = read(path, reading.told.given(loader_of(path).takes))
     if mended:
-        source = Mended(scan.source, None if isinstance(scan.source, Frames) else scan.missing)
-        scan = Scan.of(source, scan.exposures, scan.is_test, scan.provenance, scan.light)
+        frames = Mended(scan, scan.source.shape)
+        scan = Scan.of(frames, scan.exposures, scan.is_test, scan.provenance, scan.light)
     return reading.applied(scan, joined)
 
 
 @contextmanager
 def open_raw(path: str | Path, given: Mapping[str, Any]) -> Iterator[ScanFile]:
-    """The file or folder at `path`, open frame by frame, with its flats and darks and those that are `given`.
-
-    Errors: `InputError` as of `read`, and for a format whose frames are corrected already.
-    """
+    """The file or folder at `path`, open frame by frame with its flats and darks and those that are `given`. Errors:
+    `InputError` as of `read`, and for a format of corrected frames."""
     loader = _loader_for(path, given)
     if loader.opens is None:
         raise InputError(f"{path} holds corrected frames already ({loader.name}); use it as it is.")
@@ -215,8 +200,7 @@ HDF5_SUFFIXES = (".h5", ".hdf5")
 
 @dataclass(frozen=True)
 class VolumeFormat:
-    """A format of volumes of δ and β. write: an object on a grid; files: all that it makes; needs: a package, which it
-    asks for."""
+    """A format of volumes of δ and β. files: all that it makes; needs: asks for a package."""
 
     write: Callable[[Path, Object, Grid, Advance, Contents], None]
     read: Callable[[Path], Stored]
@@ -234,16 +218,14 @@ FORMATS = {
     **dict.fromkeys(TIFF_SUFFIXES, VolumeFormat(_write_tiff, read_ome_tiff)),
     ZARR_SUFFIX: VolumeFormat(write_ome_zarr, read_ome_zarr, needs=require_zarr),
     ".vti": VolumeFormat(write_vti, read_vti),
-    ".nrrd": VolumeFormat(write_nrrd, read_nrrd, both),
-    ".mrc": VolumeFormat(write_mrc, read_mrc, both),
+    ".nrrd": VolumeFormat(write_nrrd, partial(read_both, read_one=read_nrrd), both),
+    ".mrc": VolumeFormat(write_mrc, partial(read_both, read_one=read_mrc), both),
 }
 
 
 def volume_format(path: Path, called: str = "a volume") -> VolumeFormat:
-    """The format that the suffix of `path` names; `InputError` for any other, and where its package is missing.
-
-    called: what the message calls the path.
-    """
+    """The format of the suffix of `path`, which messages call `called`; `InputError` for others, and for a missing
+    package."""
     found = FORMATS.get(path.suffix.lower())
     require(
         found is not None,
@@ -263,10 +245,8 @@ def write_volume_file(
     of: Contents = REFRACTION,
     beside: Beside = ALONE,
 ) -> None:
-    """Write δ and β (or what arrays are `of`) of `obj` on `grid` in the format that the suffix of `path` names.
-
-    beside: what more to write of each voxel; of the formats only HDF5 holds that.
-    """
+    """Write δ and β (or arrays `of`) of `obj` on `grid`, by the suffix of `path`, with what is `beside` them in
+    HDF5."""
     if beside and path.suffix.lower() in HDF5_SUFFIXES:
         write_voxels(path, obj, grid, on_progress, of, beside)
     else:
@@ -332,6 +312,6 @@ def _pages(path: Path) -> np.ndarray:
     require(path.is_file(), f"{path} must be a TIFF file, but there is none; correct the path.")
     pages = all_images(path)
     shapes = sorted({page.shape for page in pages})
-    grey = len(shapes) == 1 and len(shapes[0]) == 2 and all(page.dtype.kind in "iuf" for page in pages)
-    require(grey, f"{path} must hold grey images of one size, but it holds {', '.join(map(str, shapes)) or 'none'}.")
+    one = len(shapes) == 1
+    require(one, f"{path} must hold grey images of one size, but it holds {', '.join(map(str, shapes)) or 'none'}.")
     return finite(f"{path}", np.stack(pages))

@@ -22,8 +22,7 @@ from ..checks import InputError, require, require_regular
 from .room import machine_memory
 
 RATIO = 1100
-"""Declared bytes over those of a file, at most: deflate, the densest that readers know, makes zeros 1032 times smaller.
-"""
+"""Declared bytes over those of a file, at most: deflate makes zeros 1032 times smaller."""
 SMALL = 1 << 26
 """Bytes that any file may declare."""
 DEEPEST = 64
@@ -139,8 +138,8 @@ def xml_fault(content: bytes) -> str:
     text = content[: content.rindex(APPENDED)] if APPENDED in content else content
     for name, count in COUNT.findall(text):
         most = MOST_COMPONENTS if name == b"NumberOfComponents" else RATIO * len(content)
-        if len(count) > LONGEST or int(count) > most:
-            return f"it declares {count.decode()[:LONGEST]} points, cells or components, but has {len(content)} bytes"
+        if fault := _excess(count, most, "points, cells or components", content):
+            return fault
     depth = 0
     for tag in TAG.finditer(text):
         if tag[2][:1] in b"!?" or tag[3]:
@@ -178,8 +177,8 @@ def legacy_fault(file: bytes) -> str:
     """The fault in the counts of a legacy file, above all of its cells."""
     for line in DECLARED.finditer(file):
         for count in re.findall(rb"(?<![\w.+-])\d+(?![\w.])", line[0]):
-            if len(count) > LONGEST or int(count) > 8 * len(file):  # bits are the shortest of its values
-                return f"it declares {count.decode()[:LONGEST]} values, but has {len(file)} bytes"
+            if fault := _excess(count, 8 * len(file), "values", file):  # bits are the shortest of its values
+                return fault
     lines = file[:1024].split(b"\n", 3)
     binary = len(lines) > 2 and lines[2].strip().upper() == b"BINARY"
     version = re.match(rb".{22}[ \t]*(\d+)\.\d+", file)  # VTK too takes what it cannot read for an old version
@@ -200,13 +199,18 @@ def legacy_fault(file: bytes) -> str:
     return ""
 
 
+def _excess(count: bytes, most: int, what: str, content: bytes) -> str:
+    """The fault of a count of more than `most`, in digits."""
+    too_many = len(count) > LONGEST or int(count) > most
+    return f"it declares {count.decode()[:LONGEST]} {what}, but has {len(content)} bytes" if too_many else ""
+
+
 def ply_fault(content: bytes) -> str:
     """The fault in the counts of a PLY file."""
     header = content[: content.find(b"end_header") + 1 or len(content)]
-    for count in ELEMENT.findall(header):
-        if len(count) > LONGEST or int(count) > len(content):
-            return f"it declares {count.decode()[:LONGEST]} elements, but has {len(content)} bytes"
-    return ""
+    return next(
+        (fault for count in ELEMENT.findall(header) if (fault := _excess(count, len(content), "elements", content))), ""
+    )
 
 
 def blocks_fault(content: bytes) -> str:
@@ -244,8 +248,7 @@ def _headers(content: bytes, size: int) -> Iterator[bytes]:
 
 
 def cells_fault(data: Any) -> str:
-    """The fault in the cells of a vtkPolyData or vtkUnstructuredGrid: corners that are no points, or too few or too
-    many corners for the cell's type."""
+    """Cells of a vtkPolyData or vtkUnstructuredGrid with corners that are no points, or of a wrong number."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     points = data.GetNumberOfPoints()

@@ -1,5 +1,4 @@
-"""HDF5: files opened with clear messages, and new ones: whole or not at all, with checksums of their values and a seal,
-on disks that may be full."""
+"""HDF5: files opened with clear messages, and new ones written whole or not at all, with checksums and a seal."""
 
 from __future__ import annotations
 
@@ -11,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, cast
 
 import h5py
 import numpy as np
@@ -21,9 +20,8 @@ from ..checks import InputError, MissingError, UnsaidError, is_of_memory, requir
 from ..units import unit_factor
 from .atomic import atomic_path
 from .guard import require_memory
-from .hdf5_guard import WRITING, filters_missing_in, opened_for_reading, require_own
+from .hdf5_guard import WRITING, filters_missing_in, opened_for_reading, require_own, require_sealed, seal, summed
 from .provenance import ATTRIBUTE, attribute
-from .seal import require_sealed, seal, summed
 
 
 @contextmanager
@@ -76,10 +74,8 @@ class Fields:
         return next((name for name in names if name in self.group), None)
 
     def need(self, *names: str, way_out: str = "add it", stand_in: Mapping[str, Any] = MappingProxyType({})) -> str:
-        """The first of `names` that exists; `InputError`, with the advice `way_out`, when none does.
-
-        stand_in: of an `UnsaidError`, where an option can say it.
-        """
+        """The first of `names` that exists; otherwise `InputError` with a `way_out`, or `UnsaidError` with
+        `stand_in`."""
         found = self.find(*names)
         if found is None:
             others = "".join(f" (or {self._below}/{name})" for name in names[1:])
@@ -104,8 +100,12 @@ class Fields:
     def numbers(self, name: str) -> np.ndarray:
         """All of the dataset `name` as float64; `InputError` where none of it was ever written."""
         found = self.dataset(name)
-        if found.size and _is_unwritten(found):  # HDF5 would give zeros
-            raise InputError(f"{self.label(name)} must be written, but it has no data; write it, or take it out.")
+        plan = found.id.get_create_plist()
+        held = plan.get_virtual_count() if found.is_virtual else found.id.get_storage_size()
+        require(
+            found.size == 0 or held > 0 or plan.fill_value_defined() == h5d.FILL_VALUE_USER_DEFINED,
+            f"{self.label(name)} must be written, but it has no data; write it, or take it out.",  # HDF5 gives zeros
+        )
         require_memory(self.label(name), 8 * int(np.prod(found.shape, dtype=object)))
         return np.asarray(found[()], dtype=np.float64)
 
@@ -114,13 +114,6 @@ class Fields:
         said = self.dataset(name).attrs
         text = attribute_text(said.get("units", said.get("unit")))
         return unit_factor(self.label(name), default if text is None else text, table)
-
-
-def _is_unwritten(dataset: h5py.Dataset) -> bool:
-    """Whether a dataset holds nothing but the value that HDF5 gives where nobody said one."""
-    plan = dataset.id.get_create_plist()
-    held = plan.get_virtual_count() if dataset.is_virtual else dataset.id.get_storage_size()
-    return held == 0 and plan.fill_value_defined() != h5d.FILL_VALUE_USER_DEFINED
 
 
 def attribute_text(value: Any) -> str | None:
@@ -186,8 +179,16 @@ def room_for(
     chunk: tuple[int, ...] | None = None,
     values: np.ndarray | None = None,
 ) -> h5py.Dataset:
-    """A new dataset of this shape with checksums (Fletcher 1982), to be filled in parts as large as `chunk`."""
-    chunk = chunk or _chunk(shape, np.dtype(dtype).itemsize)
+    """A new dataset of this shape with checksums (Fletcher 1982), to be filled in parts as large as `chunk`: whole
+    trailing axes, as many as fit into `LARGE`, and a part of the next one, where that is left out."""
+    if chunk is None:
+        parts, itemsize = list(shape), np.dtype(dtype).itemsize
+        for axis in range(len(shape)):
+            rest = itemsize * math.prod(shape[axis + 1 :])
+            parts[axis] = max(1, min(shape[axis], LARGE // max(rest, 1)))
+            if parts[axis] > 1 or rest <= LARGE:
+                break
+        chunk = tuple(parts)
     return group.create_dataset(name, shape, dtype, data=values, chunks=chunk, fletcher32=True)
 
 
@@ -202,25 +203,11 @@ def require_room(path: str | Path, size: int) -> None:
     )
 
 
-def _chunk(shape: tuple[int, ...], itemsize: int) -> tuple[int, ...]:
-    """Whole trailing axes, as many as fit into `LARGE`, and a part of the next one; at least one row."""
-    chunk = list(shape)
-    for axis in range(len(shape)):
-        rest = itemsize * math.prod(chunk[axis + 1 :])
-        chunk[axis] = max(1, min(shape[axis], LARGE // max(rest, 1)))
-        if chunk[axis] > 1 or rest <= LARGE:
-            break
-    return tuple(chunk)
-
-
 class _Sink(io.RawIOBase):
     """A file that goes on after its disk has failed, as if nothing were, and says so in the end."""
 
     def __init__(self, raw: io.FileIO) -> None:
-        self._raw, self._failure = raw, None
-
-    _raw: io.FileIO
-    _failure: OSError | None
+        self._raw, self._failure = raw, cast(OSError | None, None)
 
     def settle(self) -> None:
         """Raise what went wrong, if anything did."""
@@ -241,12 +228,9 @@ class _Sink(io.RawIOBase):
         """All of `data`, or none if the disk has failed; its length in either case."""
         view = memoryview(data).cast("B")
 
-        def all_of_it() -> None:
-            rest = view
-            while len(rest):
-                rest = rest[self._raw.write(rest) :]
-
-        self._tried(all_of_it, 0)
+        rest = view
+        while len(rest) and self._failure is None:
+            rest = rest[self._tried(lambda part=rest: self._raw.write(part), 0) :]
         return len(view)
 
     def readinto(self, buffer: Any) -> int:
@@ -267,15 +251,3 @@ class _Sink(io.RawIOBase):
     def truncate(self, size: int | None = None) -> int:
         """As of a file."""
         return self._tried(lambda: self._raw.truncate(size), size or 0)
-
-    def readable(self) -> bool:
-        """It is."""
-        return True
-
-    def seekable(self) -> bool:
-        """It is."""
-        return True
-
-    def writable(self) -> bool:
-        """It is."""
-        return True

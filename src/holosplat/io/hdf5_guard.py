@@ -1,29 +1,38 @@
-"""HDF5 files that nobody vouches for: they bring their own values, not those of other files, and no more than they are.
+"""Guards of HDF5 files: they bring their own values, no more than they are, and are as they were written.
 
 A link, a virtual dataset or external storage can make a reader copy any file of this machine into what it writes.
+
+HDF5 sums up the values of chunks alone. Numbers that stand for themselves, texts, names and the index of chunks have no
+checksum, and a flipped bit in them can become another number, or crash the library. So a seal behind the end of our own
+files has the SHA-256 of all bytes that are in no such chunk; it is held against the file before the library sees it.
+Other programs pass over bytes behind the end, and a program that writes to the file cuts them off: its seal is then
+gone.
 """
 
 from __future__ import annotations
 
 import errno
+import hashlib
+import io
 import math
 import os
 import re
+import struct
 import time
 import zlib
 from collections.abc import Iterator
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import h5py
+import numpy as np
 from h5py import h5d, h5l, h5o, h5p, h5z  # pyright: ignore[reportAttributeAccessIssue]  # compiled, without stubs
 
 from ..checks import InputError, require, require_regular, warn
 from .guard import DEEPEST, SMALL, require_declared
 from .room import free_memory
-from .seal import require_sealed
 
 MOST = 200_000
 """Links in a file, at most: larger ones are no scans, and take minutes to look through."""
@@ -97,35 +106,55 @@ def require_own(file: h5py.File, path: Path) -> None:
 
 def _others(file: h5py.File, path: Path, allowed: bool) -> list[Path]:
     """The HDF5 files that an open one refers to, once all else of it is in order."""
-    size, found = path.stat().st_size, list[Path]()
-    for name, kind in _links(file, path):
-        label = f"{path}: /{name.decode(errors='replace')}"
+    found, links = list[Path](), list[tuple[bytes, int]]()
+
+    def take(name: bytes, info: h5l.LinkInfo) -> bool | None:
+        links.append((name, info.type))
+        return True if len(links) > MOST else None
+
+    file.id.links.visit(take, info=True)  # which follows none of them
+    require(len(links) <= MOST, f"{path} must hold at most {MOST} entries, but it holds more.")
+    for name, kind in links:
+        inner = f"/{name.decode(errors='replace')}"
         require(name.count(b"/") < DEEPEST, f"{path} must not be nested more than {DEEPEST} deep, but it is.")
         if kind == h5l.TYPE_EXTERNAL:
-            require(allowed, _refers(path, name, "is a link to another file"))
-            found += linked(path, label, file.id.links.get_val(name)[0])
+            require(allowed, _refers(path, inner, "is a link to another file"))
+            linked = os.fsdecode(file.id.links.get_val(name)[0])
+            found += _required(path, f"{path}: {inner}", [linked], LINKS)
         elif kind == h5l.TYPE_HARD and h5o.get_info(file.id, name).type == h5o.TYPE_DATASET:
-            found += _dataset_files(h5d.open(file.id, name), path, name, allowed, size)
+            found += _dataset_files(h5d.open(file.id, name), path, inner, allowed)
     return found
 
 
-def _dataset_files(dataset: h5d.DatasetID, path: Path, name: bytes, allowed: bool, size: int) -> list[Path]:
-    """The HDF5 files that a dataset of the file `path` refers to, once its values are in order."""
-    label, plan = f"{path}: /{name.decode(errors='replace')}", dataset.get_create_plist()
+def _dataset_files(dataset: h5d.DatasetID, path: Path, inner: str, allowed: bool) -> list[Path]:
+    """The HDF5 files that the dataset `inner` of the file `path` refers to, once its values are in order."""
+    label, plan, size = f"{path}: {inner}", dataset.get_create_plist(), path.stat().st_size
     unknown_filters(plan)  # loads those that are installed; others are named where values are read
     if dataset.shape is None:  # a null dataspace holds nothing, which whoever wants a value says
         return []
     declared = math.prod(dataset.shape, start=dataset.get_type().get_size())
-    virtual, external = plan.get_layout() == h5d.VIRTUAL, plan.get_external_count() > 0
-    others = virtual and any(plan.get_virtual_filename(n) != "." for n in range(plan.get_virtual_count()))
-    require(allowed or not (others or external), _refers(path, name, "has its values in another file"))
+    virtual = plan.get_layout() == h5d.VIRTUAL
+    sources = [plan.get_virtual_filename(n) for n in range(plan.get_virtual_count())] if virtual else []
+    names = [name for name in dict.fromkeys(sources) if name != "."]
+    storage = [plan.get_external(n) for n in range(plan.get_external_count())]
+    require(allowed or not (names or storage), _refers(path, inner, "has its values in another file"))
     if virtual:
-        return virtual_sources(path, label, plan, declared)
-    if external:
-        require_external(path, label, plan, declared)
+        found = _required(path, label, names, VIRTUAL)
+        require_declared(label, declared, sum(place.stat().st_size for place in found) + size)
+        return found
+    if storage:
+        held = 0
+        for name, offset, part in storage:
+            (first, *_) = _required(path, label, [os.fsdecode(name)], EXTERNAL)
+            held += max(0, min(part, first.stat().st_size - offset))
+        require(
+            declared <= held,
+            f"{label} declares {declared:.3g} bytes of values, but the files beside it hold {held:.3g}; they are cut "
+            "short, or it is no honest file.",
+        )
     else:
         require_declared(label, declared, size)
-        require_chunks(dataset, label, size)
+        _require_chunks(dataset, label, size)
     return []
 
 
@@ -135,25 +164,8 @@ def is_vouched(path: Path) -> bool:
     return any(whole == known or known in whole.parents for known in _vouched)
 
 
-def _refers(path: Path, name: bytes, what: str) -> str:
-    return (
-        f"{path} must hold its own values, but /{name.decode(errors='replace')} {what}; if you trust both, add "
-        "--allow-external."
-    )
-
-
-def _links(file: h5py.File, path: Path) -> Iterator[tuple[bytes, int]]:
-    """Names and kinds of all links in a file; links are not followed."""
-    found: list[tuple[bytes, int]] = []
-
-    def take(name: bytes, info: h5l.LinkInfo) -> bool | None:
-        found.append((name, info.type))
-        return True if len(found) > MOST else None
-
-    file.id.links.visit(take, info=True)
-    if len(found) > MOST:
-        raise InputError(f"{path} must hold at most {MOST} entries, but it holds more.")
-    return iter(found)
+def _refers(path: Path, inner: str, what: str) -> str:
+    return f"{path} must hold its own values, but {inner} {what}; if you trust both, add --allow-external."
 
 
 DEFLATION = 1032
@@ -164,9 +176,8 @@ PIECE = 1 << 20
 """Bytes that are unpacked at a time."""
 
 
-def require_chunks(dataset: h5d.DatasetID, label: str, size: int) -> None:
-    """`InputError` if a chunk of `dataset`, in a file of `size` bytes, declares more than it can hold, or unpacks to
-    more than it declares."""
+def _require_chunks(dataset: h5d.DatasetID, label: str, size: int) -> None:
+    """`InputError` if a chunk of `dataset`, in a file of `size` bytes, declares or unpacks to too much."""
     plan = dataset.get_create_plist()
     if plan.get_layout() != h5d.CHUNKED:
         return
@@ -189,16 +200,8 @@ def require_chunks(dataset: h5d.DatasetID, label: str, size: int) -> None:
 
 def chunks_of(dataset: h5d.DatasetID) -> Iterator[tuple[tuple[int, ...], int, int]]:
     """Offset, filters that were left out (a bit each) and stored bytes of each chunk."""
-    if not hasattr(dataset, "chunk_iter"):  # HDF5 before 1.14
-        infos = (dataset.get_chunk_info(number) for number in range(dataset.get_num_chunks()))
-        yield from ((info.chunk_offset, info.filter_mask, info.size) for info in infos)
-        return
     found: list[tuple[tuple[int, ...], int, int]] = []
-
-    def take(info: h5d.StoreInfo) -> None:
-        found.append((info.chunk_offset, info.filter_mask, info.size))
-
-    dataset.chunk_iter(take)
+    dataset.chunk_iter(lambda info: found.append((info.chunk_offset, info.filter_mask, info.size)))
     yield from found
 
 
@@ -250,38 +253,9 @@ SERIES = re.compile(r"%\d*b")
 """Within the name of a virtual dataset's source: the number of a block."""
 
 
-def linked(path: Path, label: str, name: bytes) -> list[Path]:
-    """The files that a link of the file `path` to a file `name` may lead to; `InputError` where there is none, or it is
-    no regular file."""
-    return _required(path, label, [os.fsdecode(name)], LINKS)
-
-
-def virtual_sources(path: Path, label: str, plan: h5p.PropDCID, declared: int) -> list[Path]:
-    """The files of which a virtual dataset of `declared` bytes is put together, apart from `path` itself."""
-    names = dict.fromkeys(plan.get_virtual_filename(number) for number in range(plan.get_virtual_count()))
-    found = _required(path, label, [name for name in names if name != "."], VIRTUAL)
-    held = sum(place.stat().st_size for place in found) + path.stat().st_size
-    require_declared(label, declared, held)
-    return found
-
-
 def virtual_places(path: Path, name: str) -> list[Path]:
     """The files that HDF5 may open for the source `name` of a virtual dataset of the file `path`."""
     return [place for place in _places(path, name, VIRTUAL) if place.is_file()]
-
-
-def require_external(path: Path, label: str, plan: h5p.PropDCID, declared: int) -> None:
-    """`InputError` unless the files of a dataset with external storage are regular, and hold what it declares."""
-    parts = [plan.get_external(number) for number in range(plan.get_external_count())]
-    held = 0
-    for name, offset, size in parts:
-        (first, *_) = _required(path, label, [os.fsdecode(name)], EXTERNAL)
-        held += max(0, min(size, first.stat().st_size - offset))
-    require(
-        declared <= held,
-        f"{label} declares {declared:.3g} bytes of values, but the files beside it hold {held:.3g}; they are cut "
-        "short, or it is no honest file.",
-    )
 
 
 def _required(path: Path, label: str, names: list[str], prefix: str) -> list[Path]:
@@ -311,3 +285,101 @@ def _places(path: Path, name: str, prefix: str) -> Iterator[Path]:
             yield from (one for one in sorted(place.parent.glob("*")) if like.fullmatch(one.name))
         else:
             yield place
+
+
+MAGIC = b"holosplat sealed"
+"""With which a seal begins and ends."""
+ENDING = struct.Struct(f"<QQ32s{len(MAGIC)}s")
+"""Length of the HDF5 file, length of the packed ranges, SHA-256, and the seal's name."""
+START = struct.Struct("<8sB31xQ")
+"""The first bytes of an HDF5 file: its signature, the version 0 of what follows, and where it ends."""
+SIGNATURE = b"\x89HDF\r\n\x1a\n"
+BLOCK = 1 << 20
+RANGE, CHUNK = 16, 13
+"""Bytes of a range, and those that a chunk takes of the file at least: a value, its checksum, and where they are."""
+
+
+def summed(file: h5py.File) -> np.ndarray:
+    """Offsets and sizes [N, 2] of the chunks whose values have checksums, in order."""
+    file.flush()  # they have their places then
+    found: list[tuple[int, int]] = []
+
+    def take(name: str, item: h5py.Group | h5py.Dataset) -> None:
+        if isinstance(item, h5py.Dataset) and item.chunks and item.fletcher32:
+            item.id.chunk_iter(lambda one: found.append((one.byte_offset, one.size)))
+
+    file.visititems(take)
+    return np.array(sorted(found), dtype="<i8").reshape(-1, 2)
+
+
+def seal(raw: IO[bytes], ranges: np.ndarray) -> None:
+    """Put the seal behind a closed HDF5 file that is open for reading and writing."""
+    length, packed = raw.seek(0, io.SEEK_END), zlib.compress(ranges.tobytes())
+    digest = _digest(raw, length, ranges)
+    raw.seek(0, io.SEEK_END)
+    rest = memoryview(MAGIC + packed + ENDING.pack(length, len(packed), digest, MAGIC))
+    while rest:  # a file without a buffer may take a part
+        rest = rest[raw.write(rest) :]
+
+
+def require_sealed(path: Path) -> None:
+    """`InputError` for a file that is not as its seal says, or has a part of one; files without one pass."""
+    with path.open("rb") as raw:
+        good = _is_as_sealed(raw, raw.seek(0, io.SEEK_END))
+    require(good, f"{path} must be as it was written, but it is truncated or damaged; bring back the whole file.")
+
+
+def _is_as_sealed(raw: IO[bytes], size: int) -> bool:
+    """Whether a file of so many bytes is as its seal says, or has none."""
+    if size < START.size + ENDING.size:
+        return True
+    raw.seek(size - ENDING.size)
+    length, packed, digest, name = ENDING.unpack(raw.read(ENDING.size))
+    if name != MAGIC:
+        return not _has_begun(raw)
+    if length + len(MAGIC) + packed + ENDING.size != size:
+        return False
+    most = max(BLOCK, RANGE * (length // CHUNK))
+    if packed > most + most // 1000 + BLOCK:  # deflate makes nothing longer than that
+        return False
+    raw.seek(length + len(MAGIC))
+    ranges = _unpacked(raw.read(packed), length, most)
+    return ranges is not None and _digest(raw, length, ranges) == digest
+
+
+def _has_begun(raw: IO[bytes]) -> bool:
+    """Whether a seal begins where the HDF5 file ends, however little is left of it."""
+    raw.seek(0)
+    signature, version, end = START.unpack(raw.read(START.size))
+    if signature != SIGNATURE or version != 0 or end >= 1 << 63:
+        return False
+    raw.seek(end)
+    begun = raw.read(len(MAGIC))
+    return bool(begun) and MAGIC.startswith(begun)
+
+
+def _unpacked(packed: bytes, length: int, most: int) -> np.ndarray | None:
+    """The ranges in a seal of a file of `length` bytes, unpacked to `most` bytes; None if they cannot be of such a
+    file."""
+    try:
+        unpacker = zlib.decompressobj()
+        values = np.frombuffer(unpacker.decompress(packed, most), dtype="<i8").reshape(-1, 2)
+    except (zlib.error, ValueError):
+        return None
+    if not unpacker.eof:
+        return None
+    starts, sizes = values[:, 0], values[:, 1]
+    sound = (sizes > 0).all() and (starts >= 0).all() and (sizes <= length - np.minimum(starts, length)).all()
+    return values if sound and (starts[1:] >= starts[:-1] + sizes[:-1]).all() else None
+
+
+def _digest(raw: IO[bytes], length: int, ranges: np.ndarray) -> bytes:
+    """The SHA-256 of the ranges and of the first `length` bytes without them."""
+    found, at = hashlib.sha256(ranges.tobytes()), 0
+    for offset, size in [*ranges.tolist(), (length, 0)]:
+        raw.seek(at)
+        while at < offset and (block := raw.read(min(BLOCK, offset - at))):
+            found.update(block)
+            at += len(block)
+        at = offset + size
+    return found.digest()

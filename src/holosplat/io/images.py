@@ -22,10 +22,10 @@ from ..checks import InputError, finite, note, require, require_regular
 from ..scan import Scan
 from .angles import angles_of, in_order, read_angles, tell_angles
 from .atomic import atomic_folder, write_json
-from .leftovers import is_hidden
+from .lock import is_hidden
 from .raw_file import DARK, FLAT, NOTHING, PROJECTION, RAW_TAKES, Loader, ScanFile
 from .stacks import IMAGES, ImageStack, all_images, images_in, stack_of
-from .stored_frames import light_frames, reader
+from .stored_frames import light_frames, raw_loader
 from .table import Table, beam_table, exposure_table, read_exposures
 
 FIELDS = {FLAT: "flat|white|open_?beam|bright|refs?(?![a-z])|refhst", DARK: "dark"}
@@ -47,11 +47,8 @@ ANGLES = (".txt", ".csv", ".dat", ".log", ".tlt", ".npy")
 
 @contextmanager
 def open_images(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Iterator[ScanFile]:
-    """An image file, or all images in a folder (of those names that `files` says), checked except for the frames.
-
-    given: what the images do not say, by name (`TAKES`). Errors: `InputError` for damaged images, and for values that
-    are not said, with the option that says them.
-    """
+    """An image file, or images in a folder (of names that `files` says); frames are not read; `given` and errors as of
+    `open_scan`."""
     source = Path(path)
     parts = [(PROJECTION, stack_of(source))] if source.is_file() else _in_folder(source, given.get("files"))
     found = {} if source.is_file() or given.get("angles_deg") is not None else _angles(source)
@@ -86,14 +83,14 @@ def _in_folder(folder: Path, pattern: str | None) -> list[tuple[int, Any]]:
     """The projections in a folder, or in a folder within it, and the flats and darks beside them."""
     places = _places(folder)
     light = {kind: _fields_of_light(folder, places, kind) for kind in FIELDS}
-    apart = {kind for kind in FIELDS if _folders_of(folder, kind)}
+    apart = {_kind(path) for path in _folders(folder)}
     files = [file for place in places for file in images_in(place, pattern) if _kind(file) in {None, *apart}]
     arrays = [] if places or pattern else _arrays_of(folder, PROJECTION)
     named = f" named {pattern}" if pattern else ""
     require(
         len(files) + len(arrays) > 0, f"{folder} must hold projections ({', '.join(IMAGES)}), but it holds none{named}."
     )
-    unread = [path.name for path in _folders(folder) if _kind(path) is None and path not in places]
+    unread = [path.name for path in _of_images(folder) if _kind(path) is None and path not in places]
     if unread:
         note(f"{folder}: the images in {', '.join(unread)} are not read")
     stack = light_frames(arrays[0], "proj|data", PROJECTION) if arrays else ImageStack.of(in_order(files))
@@ -102,7 +99,7 @@ def _in_folder(folder: Path, pattern: str | None) -> list[tuple[int, Any]]:
 
 def _places(folder: Path) -> list[Path]:
     """The folders of projections: those within `folder` that are named so, or itself, or the only one that is left."""
-    inner = [path for path in _folders(folder) if _kind(path) is None]
+    inner = [path for path in _of_images(folder) if _kind(path) is None]
     named = [path for path in inner if PROJECTIONS.match(path.name)]
     own = [file for file in images_in(folder) if _kind(file) is None]
     places = named or ([folder] if own else inner)
@@ -115,8 +112,12 @@ def _places(folder: Path) -> list[Path]:
 
 
 def _folders(folder: Path) -> list[Path]:
-    """The folders of images within `folder`, by name."""
-    return sorted(path for path in folder.iterdir() if path.is_dir() and not is_hidden(path) and images_in(path))
+    """The folders within `folder`, by name."""
+    return sorted(path for path in folder.iterdir() if path.is_dir() and not is_hidden(path))
+
+
+def _of_images(folder: Path) -> list[Path]:
+    return [path for path in _folders(folder) if images_in(path)]
 
 
 def _fields_of_light(folder: Path, places: list[Path], kind: int) -> Any:
@@ -125,7 +126,7 @@ def _fields_of_light(folder: Path, places: list[Path], kind: int) -> Any:
 
     Errors: `InputError` for a folder of such a name without frames, and for several arrays.
     """
-    inner = _folders_of(folder, kind)
+    inner = [path for path in _folders(folder) if _kind(path) == kind]
     images = [file for path in inner for file in images_in(path)]
     images += [file for file in images_in(folder) if _kind(file) == kind]
     if not inner:
@@ -144,11 +145,6 @@ def _fields_of_light(folder: Path, places: list[Path], kind: int) -> Any:
         f"--{KINDS[kind]}.",
     )
     return light_frames(files[0], FIELDS[kind], kind) if files else None
-
-
-def _folders_of(folder: Path, kind: int) -> list[Path]:
-    """The folders within `folder` whose names say that they are of `kind`, whatever they hold."""
-    return sorted(path for path in folder.iterdir() if path.is_dir() and not is_hidden(path) and _kind(path) == kind)
 
 
 def _arrays_in(folder: Path) -> list[Path]:
@@ -206,14 +202,13 @@ def _tell_order(found: ScanFile) -> None:
 def _recognises(path: Path) -> bool:
     if path.is_file():
         return path.suffix.lower() in (*IMAGES, ".npy")
-    folders = any(PROJECTIONS.match(one.name) or _kind(one) for one in _folders(path))
+    folders = any(PROJECTIONS.match(one.name) or _kind(one) for one in _of_images(path))
     return bool(images_in(path)) or folders or bool(_arrays_of(path, PROJECTION))
 
 
-LOADER = Loader(
-    *("images", f"images ({', '.join(IMAGES)}), one file or a folder of them, or an array (.npy)", _recognises),
-    *(reader(open_images), (*RAW_TAKES, "files", "black", "white"), open_images, True),
-)
+MARK = f"images ({', '.join(IMAGES)}), one file or a folder of them, or an array (.npy)"
+OF_IMAGES = (*RAW_TAKES, "files", "black", "white")
+LOADER = raw_loader("images", MARK, _recognises, open_images, OF_IMAGES, is_general=True)
 
 
 XTEKCT = ".xtekct"
@@ -283,10 +278,11 @@ def _nikon_entries(path: Path) -> Mapping[str, str]:
     return parser[SECTION]
 
 
-NIKON = Loader(
-    *("nikon", f"an {XTEKCT} file of a Nikon scanner", lambda path: path.is_file() and path.suffix.lower() == XTEKCT),
-    *(reader(open_nikon), (*RAW_TAKES, "files"), open_nikon),
-)
+def _is_nikon(path: Path) -> bool:
+    return path.is_file() and path.suffix.lower() == XTEKCT
+
+
+NIKON = raw_loader("nikon", f"an {XTEKCT} file of a Nikon scanner", _is_nikon, open_nikon, (*RAW_TAKES, "files"))
 
 
 FORMAT = "holosplat TIFF 1"
@@ -338,20 +334,17 @@ def _pages(file: Path, count: int) -> list[np.ndarray]:
     """The `count` pages of a TIFF file, each [H, W]."""
     pages = all_images(file)
     require(len(pages) == count, f"{file} must hold {count} pages, one a frame, but it holds {len(pages)}.")
-    for page in pages:
-        grey = page.ndim == 2 and page.dtype.kind in "iuf"
-        require(grey, f"{file} must hold grey images of numbers, but one is {page.dtype} of the shape {page.shape}.")
     return pages
 
 
-def _is_own(path: Path) -> bool:
-    """The folder, or in it scan.json or an image."""
+def _own_folder(path: Path) -> Path | None:
+    """The folder of a scan of our own that is named by itself, its scan.json or an image in it; None for others."""
     named = path.name == SCAN or path.suffix.lower() in (".tif", ".tiff")
-    return (_folder(path) / SCAN).is_file() and (path.is_dir() or named)
+    folder = path if path.is_dir() else path.parent if named else None
+    return folder if folder and (folder / SCAN).is_file() else None
 
 
-def _folder(path: Path) -> Path:
-    return path if path.is_dir() else path.parent
-
-
-TIFF = Loader("tiff", f"a folder with {SCAN}, or an image in it", _is_own, lambda path, given: read_tiff(_folder(path)))
+TIFF = Loader(
+    *("tiff", f"a folder with {SCAN}, or an image in it", lambda path: _own_folder(path) is not None),
+    lambda path, given: read_tiff(_own_folder(path) or path),
+)

@@ -80,21 +80,33 @@ class Raster:
         return wide
 
 
-class Stitched(Derived):
-    """Wide frames of those at `ones` [n] and the opposite ones at `others` [n]."""
+class Rearranged(Derived):
+    """Frames made from those of a scan, which are read when they are asked for."""
 
-    def __init__(
-        self, frames: np.ndarray | Frames, missing: np.ndarray | None, pairs: np.ndarray, raster: Raster
-    ) -> None:
-        self._frames, self._missing, self._pairs, self._raster = frames, missing, pairs, raster
-        self.shape = (len(pairs), frames.shape[1], len(raster.columns))
+    def __init__(self, scan: Scan, shape: tuple[int, int, int]) -> None:
+        self.source, self.shape = scan.source, shape
+        self.missing = None if isinstance(scan.source, Frames) else scan.missing
+
+    def taken(self, numbers: np.ndarray) -> Taken:
+        """The scan's frames `numbers` [K], with their missing pixels."""
+        if isinstance(self.source, Frames):
+            return self.source.with_missing(numbers)
+        return self.source[numbers], None if self.missing is None else self.missing[numbers]
+
+
+class Stitched(Rearranged):
+    """Wide frames of a scan's, each of one and the opposite one, which `pairs` [n, 2] number."""
+
+    def __init__(self, scan: Scan, pairs: np.ndarray, raster: Raster) -> None:
+        super().__init__(scan, (len(pairs), scan.views.shape[0], len(raster.columns)))
+        self._pairs, self._raster = pairs, raster
 
     def with_missing(self, numbers: np.ndarray) -> Taken:
         """See `Frames.with_missing`."""
         total, weight = np.zeros((2, len(numbers), *self.shape[1:]))
         ways = (self._raster.upright, self._raster.mirrored)
         for which, place, share in zip(self._pairs[numbers].T, ways, self._raster.weights()):
-            frames, missing = _taken(self._frames, self._missing, which)
+            frames, missing = self.taken(which)
             known = share if missing is None else share * (place(missing.astype(np.float32)) < 0.5)
             total += place(frames) * known
             weight += known
@@ -105,17 +117,16 @@ class Stitched(Derived):
         return filled("the stitched frames", found, np.zeros(none.shape, dtype=bool), none, numbers)
 
 
-class Placed(Derived):
-    """Frames as parts of taller ones of `rows` rows, from the row `first` [N] on; beyond, their outermost rows stand
-    for what is not known."""
+class Placed(Rearranged):
+    """A scan's frames from row `first` [N] on in `rows` rows; other rows are missing, and repeat the outermost."""
 
-    def __init__(self, frames: np.ndarray | Frames, missing: np.ndarray | None, first: np.ndarray, rows: int) -> None:
-        self._frames, self._missing, self._first = frames, missing, first
-        self.shape = (len(first), rows, frames.shape[2])
+    def __init__(self, scan: Scan, first: np.ndarray, rows: int) -> None:
+        super().__init__(scan, (len(first), rows, scan.views.shape[1]))
+        self._first = first
 
     def with_missing(self, numbers: np.ndarray) -> Taken:
         """See `Frames.with_missing`."""
-        frames, missing = _taken(self._frames, self._missing, numbers)
+        frames, missing = self.taken(numbers)
         row = np.arange(self.shape[1]) - self._first[numbers][:, None]
         nearest = row.clip(0, frames.shape[1] - 1)[:, :, None]
         gaps = np.zeros((len(numbers), *self.shape[1:]), dtype=bool)
@@ -125,16 +136,9 @@ class Placed(Derived):
         return np.take_along_axis(frames, nearest, 1), gaps
 
 
-def _taken(frames: np.ndarray | Frames, missing: np.ndarray | None, numbers: np.ndarray) -> Taken:
-    """The frames `numbers`, with their missing pixels."""
-    if isinstance(frames, Frames):
-        return frames.with_missing(numbers)
-    return frames[numbers], None if missing is None else missing[numbers]
-
-
 def heightened(scan: Scan) -> Scan:
-    """The scan on frames as tall as what the views show together, if these turn about one axis and move along it so far
-    that none of its rows is in all frames, which is said; else the scan as it is."""
+    """The scan on frames as tall as all views together, which it says, for one that moves farther along one axis than a
+    frame."""
     views = scan.views
     upright = np.allclose(views.rotations[:, 1], [0.0, 1.0, 0.0]) and views.has_one_pixel and views.sources is None
     rows, height = views.shifts[:, 1] / views.pixel_size if upright else np.zeros(len(views)), views.shape[0]
@@ -142,7 +146,7 @@ def heightened(scan: Scan) -> Scan:
         return scan
     first = np.round(rows - rows.min()).astype(int)
     more = int(first.max())
-    frames = Placed(scan.source, None if isinstance(scan.source, Frames) else scan.missing, first, height + more)
+    frames = Placed(scan, first, height + more)
     shifts = views.shifts.copy()
     shifts[:, 1] = (rows - first + 0.5 * more) * views.pixel_size
     note(
@@ -161,8 +165,8 @@ def of_parts(found: Exposures, tall: Scan, scan: Scan) -> Exposures:
 
 
 def stitched(scan: Scan) -> Scan:
-    """The scan of half a turn on frames as wide as what the turn sweeps, if it is a half acquisition whose frames all
-    have opposite ones, which is said; else the scan as it is."""
+    """The scan of half a turn on wider frames, which it says, for a half acquisition whose frames all have opposite
+    ones."""
     if not is_half_acquisition(scan):
         return scan
     views, angles = scan.views, angles_of(scan.views)
@@ -178,7 +182,7 @@ def stitched(scan: Scan) -> Scan:
             "frames are joined to wider ones only where each has an opposite one"
         )
         return scan
-    frames = Stitched(scan.source, None if isinstance(scan.source, Frames) else scan.missing, pairs, raster)
+    frames = Stitched(scan, pairs, raster)
     columns, exposures = raster.columns, scan.exposures[first]
     shifts = exposures.views.shifts.copy()
     shifts[:, 0] = (raster.first - raster.axis - 0.5 + 0.5 * len(columns)) * views.pixel_size

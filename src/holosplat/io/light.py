@@ -26,9 +26,11 @@ def write_light(
     still: np.ndarray | None = None,
     marks: Mapping[str, str] = MappingProxyType({}),
 ) -> None:
-    """Coefficients [V, (K + 1)²] of `exp(Σ c m)`, m the products of cosines of 0 to K half waves of `smooth_modes`, and
-    the light [H, W] that all frames have in common; None: there is none.
-    marks: further attributes."""
+    """Write the light of frames: coefficients [V, (K + 1)²] of exp(Σ c m), m the products of cosines of 0 to K half
+    waves (`smooth_modes`), and the light [H, W] that all frames have in common; None: there is none.
+
+    marks: more attributes.
+    """
     from ..optics.background import ORDER  # needs torch, which takes longer than all else
 
     with new_hdf5(path) as file:
@@ -69,8 +71,7 @@ def write_divided_light(group: h5py.Group, light: DividedLight) -> None:
 
 
 def read_divided_light(fields: Fields, projections: np.ndarray) -> DividedLight | None:
-    """That of a file's `projections` [N] bool, or None where it says nothing. Errors: `InputError` for what does not
-    fit."""
+    """The light of a file's `projections` [N] bool; None without such. Errors: `InputError` for what does not fit."""
     group = fields.group.get(GROUP)
     if not isinstance(group, h5py.Group):
         return None

@@ -1,29 +1,141 @@
-"""One writer of a folder: a lock that says which process of which machine writes there, and that the kernel holds.
+"""Half-written files: their names, their removal after a killed process, and their way to the disk. One writer of a
+folder: a lock that says which process of which machine writes there, and that the kernel holds.
 
-The kernel lets go of it when the process ends, however it does, and knows processes of other containers, too. Where a
-file system has no such locks, processes of the same machine and namespace are known by their number and beginning.
+The kernel lets go of the lock when the process ends, however it does, and knows processes of other containers, too.
+Where a file system has no such locks, processes of the same machine and namespace are known by their number and
+beginning.
 """
 
 from __future__ import annotations
 
+import glob
 import json
 import os
+import re
+import secrets
+import shutil
 import socket
 import time
+import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..checks import InputError
-from .atomic import require_parent
-from .leftovers import LOCK, clear_all_leftovers, is_alive, namespace, temporary_name
+from ..checks import InputError, require
 
 try:
     import fcntl
 except ImportError:  # Windows
     fcntl = None
+
+LOCK = ".lock"
+"""The file that says who writes to a folder."""
+RECORD = "provenance.json"
+"""The file of a folder that says which commands wrote there, before anything else is there."""
+LONGEST = 180
+"""Bytes of a file's name that its temporary name keeps: with what is added it stays below the 255 of file systems."""
+PATTERN = re.compile(r"^\..*~(?P<host>[0-9a-f]{8})-(?P<process>[0-9a-f]+)-[0-9a-f]{8}(\.[^.]*)?$", re.DOTALL)
+
+
+def host() -> str:
+    """Eight digits that stand for this machine, and for the container in it."""
+    return f"{zlib.crc32(f'{socket.gethostname()} {namespace()}'.encode()):08x}"
+
+
+def namespace() -> str:
+    """What tells numbers of processes from those of other containers of this machine, on Linux; empty elsewhere."""
+    try:
+        return os.readlink("/proc/self/ns/pid")
+    except OSError:
+        return ""
+
+
+def temporary_name(target: Path) -> Path:
+    """A new hidden name beside `target` with its suffix, which says which process of which machine writes it."""
+    owner = f"{host()}-{os.getpid():x}-{secrets.token_hex(4)}"
+    return target.with_name(f".{_kept(target)}~{owner}{target.suffix}")
+
+
+def is_hidden(path: Path) -> bool:
+    """Whether a file or folder has a name that readers of folders pass over: it begins with a dot."""
+    return path.name.startswith(".")
+
+
+def files_in(folder: Path) -> Iterator[Path]:
+    """The files below `folder`, but for hidden ones, in order."""
+    for above, folders, names in os.walk(folder):
+        folders.sort()
+        yield from (path for name in sorted(names) if not is_hidden(path := Path(above, name)) and path.is_file())
+
+
+def is_left(path: Path) -> bool:
+    """Whether a name is that of a half-written file, or of a lock."""
+    return PATTERN.match(path.name) is not None or path.name == LOCK
+
+
+def is_begun(folder: Path) -> bool:
+    """Whether a folder holds more than locks, half-written files and the record of a command that was killed."""
+    return any(not is_left(found) and found.name != RECORD for found in folder.iterdir())
+
+
+def clear_leftovers(target: Path) -> None:
+    """Remove what processes of this machine that are no more left of `target`; where that fails, nothing is said."""
+    with suppress(OSError):
+        for found in target.parent.glob(f".{glob.escape(_kept(target))}~*"):
+            _clear(found)
+
+
+def is_alive(process: int) -> bool:
+    """Whether this machine runs a process of that number."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):  # of somebody else; of no process at all
+        return True
+    return True
+
+
+def _clear(found: Path) -> None:
+    match = PATTERN.match(found.name)
+    if match is None or match["host"] != host() or is_alive(int(match["process"], 16)):
+        return
+    if found.is_dir() and not found.is_symlink():
+        shutil.rmtree(found, ignore_errors=True)
+    else:
+        found.unlink(missing_ok=True)
+
+
+def _kept(target: Path) -> str:
+    """The beginning of a file's name without its suffix, of whole characters."""
+    return os.fsdecode(os.fsencode(target.stem)[:LONGEST]).encode("utf-8", "ignore").decode("utf-8", "ignore")
+
+
+def flushed(path: Path) -> None:
+    """Wait until a file, or the names in a folder if its file system can, are on the disk (fsync); `OSError` if it
+    fails."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        with suppress(OSError) if path.is_dir() else nullcontext():
+            os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def flushed_tree(folder: Path) -> None:
+    """The same of all files and folders in `folder`."""
+    for path, _, files in os.walk(folder):
+        for name in files:
+            flushed(Path(path, name))
+        flushed(Path(path))
+
+
+def require_parent(path: str | Path) -> None:
+    """`InputError` unless `path` lies in an existing folder."""
+    parent = Path(os.path.realpath(path)).parent
+    require(parent.is_dir(), f"{path} must lie in an existing folder, but {parent} is none; create it.")
 
 
 class TakenError(InputError):
@@ -32,8 +144,7 @@ class TakenError(InputError):
 
 @dataclass(frozen=True)
 class Writer:
-    """Who writes to a folder: its machine and process, since when; gone: whether it was of this machine and is no
-    more."""
+    """Who writes to a folder, since when; gone: whether it was a process of this machine that has ended."""
 
     host: str
     process: int
@@ -76,7 +187,9 @@ def sole_writer(folder: Path) -> Iterator[None]:
         raise InputError(f"{folder} must be writable, but writing to it failed: {error}.") from error
     _held[path] = handle
     try:
-        clear_all_leftovers(path)
+        with suppress(OSError):
+            for found in path.iterdir():
+                _clear(found)
         yield
     finally:
         with suppress(OSError):
@@ -92,7 +205,11 @@ def writer_of(folder: Path) -> Writer | None:
     text = _text(lock)
     if text is None:
         return None
-    holder = _holder(text)
+    try:
+        holder = json.loads(text)
+    except ValueError:
+        holder = None
+    holder = holder if isinstance(holder, dict) else {}
     number = holder.get("process")
     process = number if isinstance(number, int) else 0
     return Writer(str(holder.get("host", "?")), process, str(holder.get("since", "?")), _is_stale(lock, holder))
@@ -110,8 +227,7 @@ def require_unwritten(folder: Path) -> None:
 
 
 def _take(lock: Path, folder: Path) -> int | None:
-    """Put a lock of this process there, and give the open file that the kernel has locked, None where it cannot;
-    `InputError` where there is a lock of another process."""
+    """Lock `folder`: the open file that the kernel locks, None where it cannot; `InputError` if it is taken."""
     for _ in range(5):
         with suppress(FileExistsError):
             return _placed(lock)
@@ -210,38 +326,23 @@ def _text(lock: Path) -> str | None:
         return None
 
 
-def _holder(text: str) -> dict[str, Any]:
-    try:
-        found = json.loads(text)
-    except ValueError:
-        found = None
-    return found if isinstance(found, dict) else {}
-
-
 def _is_stale(lock: Path, holder: dict[str, Any]) -> bool:
     """Whether the process of a lock was one of this machine and is no more; False where that cannot be told."""
     process, boot = holder.get("process"), holder.get("boot")
     same = holder.get("host") == socket.gethostname() or (isinstance(boot, str) and boot == _boot() != "")
     if not same or not isinstance(process, int):
         return False
-    if holder.get("locked") is True and (free := _may_be_locked(lock)) is not None:
-        return free
+    if holder.get("locked") is True:
+        with suppress(OSError):
+            handle = os.open(lock, os.O_RDWR)
+            free = _is_free(handle)
+            _close(handle)
+            if free is not None:
+                return free
     if holder.get("namespace", namespace()) != namespace() or (boot or _boot()) != _boot():
         return False
     mine = process == os.getpid()
     return (not mine and not is_alive(process)) or holder.get("began") != _began("self" if mine else str(process))
-
-
-def _may_be_locked(lock: Path) -> bool | None:
-    """Whether no process has a lock by the kernel; None where that cannot be told."""
-    try:
-        handle = os.open(lock, os.O_RDWR)
-    except OSError:
-        return None
-    try:
-        return _is_free(handle)
-    finally:
-        _close(handle)
 
 
 def _boot() -> str:

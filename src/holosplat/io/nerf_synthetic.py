@@ -8,21 +8,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from PIL import Image
 
-from ..checks import InputError, UnsaidError, at_least, in_range, require, shaped
+from ..checks import InputError, in_range, require, shaped
 from ..geometry import Grid, Views
-from ..ranges import Metres, Positive, Signed, Small, checked_dataclass
+from ..ranges import Metres, Natural, Positive, Signed, Small, Within, checked_dataclass
 from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, Scan, checked_distance
 from .atomic import atomic_folder, write_json
 from .guard import undamaged
-from .raw_file import Loader, folder_with, require_said, stand_in
-from .table import Table, beam_table, exposure_table, in_order, read_exposures
+from .raw_file import Loader, folder_with, require_said
+from .table import Table, beam_table, exposure_table, read_own_exposures
 
 FINEST = 64
 """Voxels along the longer side of the field of view in which a hull is looked for."""
@@ -85,10 +84,8 @@ def write_png(path: Path, image: np.ndarray, kind: PngKind) -> None:
 
 
 def read_png(path: Path) -> tuple[np.ndarray, int]:
-    """An image's levels [H, W] as they stand in the file, and its white: 255 or 65535.
-
-    Colours must be equal and alpha opaque; `InputError` otherwise, or if the file is damaged.
-    """
+    """An image's levels [H, W] as stored, and its white: 255 or 65535. Colours must be equal and alpha opaque;
+    `InputError` otherwise, or if the file is damaged."""
     with undamaged(path, "a complete PNG image"), Image.open(path, formats=("PNG",)) as image:
         mode, values = image.mode, np.asarray(image)
     if mode.startswith("I"):  # 16 bits: "I;16", and "I" in older versions of Pillow
@@ -105,7 +102,6 @@ def read_png(path: Path) -> tuple[np.ndarray, int]:
 FORMAT = "holosplat NeRF-synthetic 1"
 TRAIN, TEST, VAL = (f"transforms_{split}.json" for split in ("train", "test", "val"))
 POINTS = "points3d.ply"
-CAMERA_DISTANCES = (10.0, 1e5)
 MOST_TANGENT = 0.02
 """The widest cameras of others that pass for parallel, as the tangent of half their angle: so much of its distance
 from the axis may a point stray, per half field of view of depth."""
@@ -117,14 +113,10 @@ class NerfOptions:
 
     png: PngKind = "grey16"
     """Kind of the images: 16-bit grey, or 8-bit RGBA for programs that read only this."""
-    camera_distance: float = 100.0
+    camera_distance: Annotated[float, Within(10, 1e5, unit="half fields of view")] = 100.0
     """Distance of the cameras from the origin, in half fields of view; larger ones are more parallel."""
-    seed_points: int = 20_000
+    seed_points: Natural = 20_000
     """Number of points in points3d.ply."""
-
-    def __post_init__(self) -> None:
-        in_range("camera_distance", self.camera_distance, *CAMERA_DISTANCES, unit="half fields of view")
-        at_least(self, 1, "seed_points")
 
 
 @checked_dataclass
@@ -208,9 +200,14 @@ def write_nerf_synthetic(
         for name, numbers in ((TRAIN, train), (TEST, np.flatnonzero(scan.is_test))):
             split = name.removeprefix("transforms_").removesuffix(".json")
             (folder / split).mkdir()
-            frames = [_write_frame(folder, f"{split}/r_{k:04d}", scan, n, head) for k, n in enumerate(numbers.tolist())]
-            for frame, n in zip(frames, numbers):
-                frame["transform_matrix"] = poses[n].tolist()
+            frames = []
+            for k, n in enumerate(numbers.tolist()):
+                path_of_image = f"{split}/r_{k:04d}"
+                grey = (scan.frames[n].astype(np.float64) - low) / (high - low or 1.0)
+                write_png(folder / f"{path_of_image}.png", grey, options.png)
+                exposure = {"index": n, **exposure_table(scan.exposures, n)}
+                pose = {"transform_matrix": poses[n].tolist()}
+                frames.append({"file_path": f"./{path_of_image}", "holosplat": exposure, **pose})
             table = {"camera_angle_x": 2 * math.atan(half), "frames": frames, "holosplat": head}
             for copy in (name, VAL) if name == TEST else (name,):
                 write_json(folder / copy, table)
@@ -222,11 +219,8 @@ def write_nerf_synthetic(
 
 
 def read_nerf_synthetic(path: str | Path, given: GivenOptics | None = None) -> Scan:
-    """The scan of a folder in the NeRF-synthetic layout.
-
-    A folder written by holosplat gives back everything, with intensities as exact as the images' bits. For a folder of
-    another program, whose cameras must be nearly parallel, `given` holds the values that the layout lacks.
-    """
+    """The scan of a NeRF-synthetic folder; `given` holds what the folders of other programs lack, whose cameras must be
+    nearly parallel. Intensities are as exact as the images' bits."""
     folder = Path(path)
     splits = [Table.read(folder / TRAIN)]
     own = "holosplat" in splits[0]
@@ -238,81 +232,45 @@ def read_nerf_synthetic(path: str | Path, given: GivenOptics | None = None) -> S
         f"{folder}: the entry holosplat of {TRAIN} and {TEST} must be the same, but it differs; take the two of one "
         "folder.",
     )
-    content = _Content.read(splits)
-    if own:
-        require(given is None, f"{folder} says itself how it was taken; leave away what is given for others' folders.")
-        return _own_scan(splits[0].table("holosplat"), content)
-    if given is None:
-        raise UnsaidError(
-            f"{folder} must say how it was taken (the entry holosplat of {TRAIN}), but it is of another program; give "
-            "the photon energy, the propagation distance and the pixel size (--energy-kev, --distance, --pixel-size).",
-            stand_in(*TAKES[:3]),
+    tables = [split.tables("frames") for split in splits]
+    require(len(tables[0]) > 0, f"{splits[0].label('frames')} must hold at least one frame, but it holds none.")
+    frames = [frame for split in tables for frame in split]
+    named = [frame.text("file_path").lower().endswith(".png") for frame in frames]  # .png is left away, or not
+    files = [frame.file("file_path", "" if whole else ".png") for frame, whole in zip(frames, named)]
+    images = [read_png(file) for file in files]
+    (first, white), is_test = images[0], np.arange(len(frames)) >= len(tables[0])
+    for file, (image, its_white) in zip(files, images):
+        same = image.shape == first.shape and its_white == white
+        this, that = (f"{a.shape} pixels and white at {w}" for a, w in ((image, its_white), images[0]))
+        require(same, f"{file} must be as {files[0].name}, with {that}, but it has {this}; convert it.")
+    levels = np.stack([image for image, _ in images]).astype(np.float64)
+    if not own:
+        require_said(str(folder), TAKES[:3] if given is None else ())
+        assert given is not None
+        exposures = _exposures_of_cameras(folder, splits, frames, (first.shape[0], first.shape[1]), given)
+        values = given.black + (given.white - given.black) / white * levels
+        return Scan(
+            values.astype(np.float32), exposures, is_test, {"converted_from": f"NeRF-synthetic folder {folder.name}"}
         )
-    return _foreign_scan(folder, splits, content, given)
-
-
-@dataclass(frozen=True)
-class _Content:
-    """Frames in the files' order: their tables; levels [N, H, W] of their images, white, and which are held out."""
-
-    frames: list[Table]
-    levels: np.ndarray
-    white: int
-    is_test: np.ndarray
-
-    @classmethod
-    def read(cls, splits: list[Table]) -> _Content:
-        tables = [split.tables("frames") for split in splits]
-        require(len(tables[0]) > 0, f"{splits[0].label('frames')} must hold at least one frame, but it holds none.")
-        frames = [frame for split in tables for frame in split]
-        files = [_image_file(frame) for frame in frames]
-        images = [read_png(file) for file in files]
-        first, white = images[0]
-        for file, (image, its_white) in zip(files, images):
-            same = image.shape == first.shape and its_white == white
-            this, that = (f"{a.shape} pixels and white at {w}" for a, w in ((image, its_white), images[0]))
-            require(same, f"{file} must be as {files[0].name}, with {that}, but it has {this}; convert it.")
-        is_test = np.arange(len(frames)) >= len(tables[0])
-        return cls(frames, np.stack([image for image, _ in images]), white, is_test)
-
-    def intensities(self, low: float, high: float) -> np.ndarray:
-        """[N, H, W] float32: black is `low`, white is `high`."""
-        return (low + (high - low) / self.white * self.levels.astype(np.float64)).astype(np.float32)
-
-
-def _write_frame(folder: Path, name: str, scan: Scan, n: int, head: dict[str, Any]) -> dict[str, Any]:
-    """Write the image of frame `n`, and return its entry in the transforms, without the pose."""
-    kind: PngKind = "grey16" if head["white"] == LEVELS["grey16"] else "rgba8"
-    span = head["high"] - head["low"]
-    grey = (scan.frames[n].astype(np.float64) - head["low"]) / (span or 1.0)
-    write_png(folder / f"{name}.png", grey, kind)
-    return {"file_path": f"./{name}", "holosplat": {"index": n, **exposure_table(scan.exposures, n)}}
-
-
-def _image_file(frame: Table) -> Path:
-    """The frame's image: the layout leaves .png away, some programs write it."""
-    return frame.file("file_path", "" if frame.text("file_path").lower().endswith(".png") else ".png")
-
-
-def _own_scan(head: Table, content: _Content) -> Scan:
+    require(given is None, f"{folder} says itself how it was taken; leave away what is given for others' folders.")
+    head = splits[0].table("holosplat")
     head.require_format(FORMAT)
-    for name, found in (("shape", list(content.levels.shape[1:])), ("white", content.white)):
+    for name, found in (("shape", list(first.shape)), ("white", white)):
         require(
             head.need(name) == found,
             f"{head.label(name)} is {head.need(name)}, but that of the images is {found}; they must be those that "
             "were written with it.",
         )
-    entries = [frame.table("holosplat") for frame in content.frames]
-    order = in_order(head, entries)
-    h, w = content.levels.shape[1:]
-    exposures = read_exposures(head, [entries[k] for k in order], (h, w))
-    frames = content.intensities(head.number("low"), head.number("high"))
-    return Scan(frames[order], exposures, content.is_test[order], head.texts("provenance"))
+    low, high = head.number("low"), head.number("high")
+    order, exposures = read_own_exposures(head, frames, (first.shape[0], first.shape[1]))
+    values = (low + (high - low) / white * levels).astype(np.float32)
+    return Scan(values[order], exposures, is_test[order], head.texts("provenance"))
 
 
-def _foreign_scan(folder: Path, splits: list[Table], content: _Content, given: GivenOptics) -> Scan:
-    """Cameras taken as parallel: the axes are turned round, and the offset of the centre of view from the origin is the
-    shift."""
+def _exposures_of_cameras(
+    folder: Path, splits: list[Table], frames: list[Table], shape: tuple[int, int], given: GivenOptics
+) -> Exposures:
+    """Exposures of frames of `shape` (H, W) by cameras that are taken for parallel; the centre of view is the shift."""
     angles = [split.number("camera_angle_x") for split in splits]
     require(len(set(angles)) == 1, f"{folder}: camera_angle_x must be the same for all frames, but it is {angles}.")
     tangent = math.tan(0.5 * angles[0])
@@ -321,7 +279,7 @@ def _foreign_scan(folder: Path, splits: list[Table], content: _Content, given: G
             f"{splits[0].label('camera_angle_x')} must be below {2 * math.atan(MOST_TANGENT):.3g} rad (beams are "
             f"parallel here), but it is {angles[0]:g}; these are perspective views, which holosplat cannot use."
         )
-    poses = np.array([frame.numbers("transform_matrix", (4, 4)) for frame in content.frames])
+    poses = np.array([frame.numbers("transform_matrix", (4, 4)) for frame in frames])
     rotations = poses[:, :3, :3].transpose(0, 2, 1) * np.array([1.0, -1.0, -1.0])[:, None]
     away = -np.einsum("vi,vi->v", poses[:, :3, 3], rotations[:, 2])
     require(
@@ -329,22 +287,17 @@ def _foreign_scan(folder: Path, splits: list[Table], content: _Content, given: G
         f"{folder}: cameras must look at the origin's side from one distance, but theirs go from {away.min():g} to "
         f"{away.max():g}; bring the images to one scale first.",
     )
-    h, w = content.levels.shape[1:]
-    metres_per_unit = given.pixel_size * w / (2 * float(away.mean()) * tangent)
+    metres_per_unit = given.pixel_size * shape[1] / (2 * float(away.mean()) * tangent)
     shifts = metres_per_unit * np.einsum("vi,vki->vk", poses[:, :3, 3], rotations[:, :2])
-    exposures = Exposures.of(Views(rotations, shifts, (h, w), given.pixel_size), given.energy_kev, given.distance)
-    origin = {"converted_from": f"NeRF-synthetic folder {folder.name}"}
-    return Scan(content.intensities(given.black, given.white), exposures, content.is_test, origin)
+    return Exposures.of(Views(rotations, shifts, shape, given.pixel_size), given.energy_kev, given.distance)
 
 
 TAKES = ("energy_kev", "distance", "pixel_size", "black", "white")
 
 
 def _read(path: Path, given: Mapping[str, float]) -> Scan:
-    if not given:
-        return read_nerf_synthetic(path)
-    require_said(str(path), [name for name in TAKES[:3] if name not in given])
-    return read_nerf_synthetic(path, GivenOptics(**given))
+    require_said(str(path), [name for name in TAKES[:3] if given and name not in given])
+    return read_nerf_synthetic(path, GivenOptics(**given) if given else None)
 
 
 LOADER = Loader("nerf-synthetic", f"a folder with {TRAIN}", folder_with(TRAIN), _read, TAKES)

@@ -19,10 +19,10 @@ from ..units import wavelength
 from ..version import __version__
 from .hdf5 import new_hdf5, put, room_for
 from .light import LIGHT, write_divided_light
-from .nxtomo_geometry import CONE
-from .raw_file import NOTHING, PROJECTION, RAW_TAKES, Loader
-from .scan_file import ANGLES, DATA, FLIPS, IMAGE_KEY, MASK, SPLIT, open_scan
-from .stored_frames import reader
+from .nxtomo_geometry import CONE, DATA_NAMES, FLIPS
+from .raw_file import NOTHING, PROJECTION, RAW_TAKES
+from .scan_file import ANGLES, IMAGE_KEY, MASK, SPLIT, open_scan
+from .stored_frames import raw_loader
 
 
 @dataclass(frozen=True)
@@ -48,13 +48,9 @@ class Add(Protocol):
 
 
 def read_scan(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Scan:
-    """The projections of an NXtomo file, flat-field corrected, and how they were taken.
-
-    Frames marked flat and dark correct the others: (frame - mean dark) / (mean flat - mean dark); frames
-    marked invalid are dropped. The projections are read when they are asked for (`StoredFrames`). given and
-    `InputError` as of `open_scan`.
-    """
-    return reader(open_scan)(Path(path), given)
+    """The projections of an NXtomo file, read when they are asked for, as (frame - mean dark) / (mean flat - mean dark)
+    if it has such frames; `given` and errors as of `open_scan`."""
+    return LOADER.read(Path(path), given)
 
 
 def write_scan(path: str | Path, scan: Scan) -> None:
@@ -142,10 +138,16 @@ def _write_entry(
     entry["definition"] = "NXtomo"
     put(entry, SPLIT, is_test.astype(np.uint8))
     data = _write_instrument(_group(entry, "instrument", "NXinstrument"), exposures, raw)
-    _write_sample(_group(entry, "sample", "NXsample"), exposures)
+    sample, rotations = _group(entry, "sample", "NXsample"), exposures.views.rotations
+    sample["name"] = "sample"
+    put(sample, "view_rotation", rotations)
+    # R(θ) is nearest to R where tr(R(θ)ᵀ R) = cos θ (R00 + R22) + sin θ (R02 - R20) is largest.
+    theta = np.arctan2(rotations[:, 0, 2] - rotations[:, 2, 0], rotations[:, 0, 0] + rotations[:, 2, 2])
+    _put(sample, "rotation_angle", np.rad2deg(theta), "deg")
+    _put(sample, "time", exposures.time, "s")
     _write_process(_group(entry, "process", "NXprocess"), provenance)
     plot = _group(entry, "data", "NXdata", signal="data", axes=["rotation_angle", ".", "."])
-    for source in (DATA, IMAGE_KEY, ANGLES[0]):
+    for source in (DATA_NAMES[0], IMAGE_KEY, ANGLES[0]):
         entry[source].attrs["target"] = f"/entry/{source}"
         plot[source.rsplit("/", 1)[1]] = entry[source]
     return data
@@ -197,16 +199,6 @@ def _write_instrument(instrument: h5py.Group, exposures: Exposures, raw: RawLayo
     return data
 
 
-def _write_sample(sample: h5py.Group, exposures: Exposures) -> None:
-    sample["name"] = "sample"
-    rotations = exposures.views.rotations
-    put(sample, "view_rotation", rotations)
-    # R(θ) is nearest to R where tr(R(θ)ᵀ R) = cos θ (R00 + R22) + sin θ (R02 - R20) is largest.
-    theta = np.arctan2(rotations[:, 0, 2] - rotations[:, 2, 0], rotations[:, 0, 0] + rotations[:, 2, 2])
-    _put(sample, "rotation_angle", np.rad2deg(theta), "deg")
-    _put(sample, "time", exposures.time, "s")
-
-
 def _write_process(process: h5py.Group, provenance: dict[str, str]) -> None:
     process["program"], process["version"] = "holosplat", __version__
     texts = _group(process, "provenance", "NXcollection")
@@ -220,7 +212,8 @@ def _escaped(key: str) -> str:
     return escaped.replace(".", "%2E") if set(escaped) == {"."} else escaped
 
 
-LOADER = Loader(
-    *("nxtomo", "an HDF5 file", lambda path: path.is_file() and h5py.is_hdf5(path)),
-    *(read_scan, (*RAW_TAKES, "entry"), open_scan, True),
-)
+def _recognises(path: Path) -> bool:
+    return path.is_file() and h5py.is_hdf5(path)
+
+
+LOADER = raw_loader("nxtomo", "an HDF5 file", _recognises, open_scan, (*RAW_TAKES, "entry"), is_general=True)

@@ -1,5 +1,4 @@
-"""Frames of the wrong kind in a file, which are left out, named or refused: flats and darks unlike the others, flats
-that lie otherwise than the projections do, projections without light or without matter."""
+"""Odd frames of a file: flats and darks unlike the others, misplaced flats, projections without light or matter."""
 
 from __future__ import annotations
 
@@ -92,8 +91,8 @@ def _listed(names: Sequence[str], which: np.ndarray) -> str:
 
 
 def without_odd(file: ScanFile, is_told: bool) -> ScanFile:
-    """The file without flats and darks that are unlike the others, which it names; is_told: with them, as --leave-out
-    says which frames to leave. Errors: `InputError` where half of them differ or more."""
+    """The file without odd flats and darks, which it names (but with them if --leave-out is told). Errors: `InputError`
+    where half of them differ or more."""
     small = {kind: [thumbnail(file.frame(n)) for n in file.numbers(kind)] for kind in (FLAT, DARK)}
     if not any(
         np.isfinite(flat).any() for flat in small[FLAT]

@@ -6,7 +6,6 @@ OME-Zarr has chunks at several resolutions, in the layout of Zarr's version 2 wi
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -39,10 +38,8 @@ def ome_grid(path: Path) -> tuple[Grid, Contents] | None:
 
 
 def read_ome_tiff(path: Path) -> Stored:
-    """δ (or µ) and β of an OME-TIFF as `write_ome_tiff` writes it, about the origin if it does not say where it lies.
-
-    Errors: `InputError` for other TIFF files, which do not say what their numbers are.
-    """
+    """δ (or µ) and β of an OME-TIFF as `write_ome_tiff` writes it; without a place it lies about the origin. Errors:
+    `InputError` for other TIFF files."""
     with open_tiff(path) as opened:
         text, count = opened.ome_metadata, len(image_numbers(opened, path))
     grid = _grid_of_ome(text or "")
@@ -78,10 +75,8 @@ def _grid_of_ome(text: str) -> Grid | None:
 
 
 def write_ome_tiff(path: Path, volume: Volume, of: Contents = REFRACTION) -> None:
-    """Write δ (or µ) and β as the channels of an OME-TIFF, float32, pages along z, with the voxels' size [µm] in it.
-
-    The place of the first voxel is that of the planes; many programs take it for 0.
-    """
+    """Write δ (or µ) and β as the channels of an OME-TIFF, float32, pages along z, with the size of voxels and the
+    place of the first one [µm], which many programs take for 0."""
     import tifffile
 
     values = np.stack(list(of.of_volume(volume).values())).astype(np.float32)
@@ -134,7 +129,12 @@ def write_ome_zarr(
         group = zarr.open_group(store=str(temporary), mode="w", zarr_format=2)
         shapes, limits = levels_of(grid.shape), np.array([[np.inf, -np.inf]] * len(NAMES))
         arrays = [_array(group, str(k), shape) for k, shape in enumerate(shapes)]
-        _fill(arrays[0], slabs_of(obj, grid, rows, on_progress), limits, of)
+        for start, part in slabs_of(obj, grid, rows, on_progress):
+            values = np.stack(list(of.of_volume(part).values()))
+            arrays[0][:, :, start : start + values.shape[2]] = values
+            flat = values.reshape(len(NAMES), -1)
+            limits[:, 0] = np.minimum(limits[:, 0], flat.min(axis=1))
+            limits[:, 1] = np.maximum(limits[:, 1], flat.max(axis=1))
         for fine, coarse in pairwise(arrays):
             for start in range(0, coarse.shape[2], CHUNK):
                 stop = min(start + CHUNK, coarse.shape[2])
@@ -143,10 +143,7 @@ def write_ome_zarr(
 
 
 def read_ome_zarr(path: Path) -> Stored:
-    """The volume of an OME-Zarr folder with the channels δ and β, as `write_ome_zarr` writes it, at its finest level.
-
-    Errors: `InputError` without the package zarr, and for other folders.
-    """
+    """The finest volume of an OME-Zarr folder of `write_ome_zarr`; `InputError` without zarr, and for other folders."""
     zarr = require_zarr()
     require(path.is_dir(), f"{path} must be a folder of OME-Zarr, but there is none; check the path.")
     with undamaged(path, "an OME-Zarr of δ and β, as `holosplat export` writes it"):
@@ -184,10 +181,7 @@ def halved(values: np.ndarray) -> np.ndarray:
 
 
 def metadata(grid: Grid, levels: int, limits: np.ndarray, of: Contents = REFRACTION) -> dict[str, Any]:
-    """What OME-Zarr says of the levels: axes, units, scales, places, and how to show the channels.
-
-    limits: least and greatest value of each channel, [2, 2].
-    """
+    """The metadata of OME-Zarr: axes, units, places, and channels with the extreme values `limits` [2, 2]."""
     axes = [{"name": "c", "type": "channel"}]
     axes += [{"name": name, "type": "space", "unit": "micrometer"} for name in "zyx"]
     size, origin = (np.array(v[::-1]) * MICROMETRES for v in (grid.voxel_size, grid.origin))
@@ -198,17 +192,12 @@ def metadata(grid: Grid, levels: int, limits: np.ndarray, of: Contents = REFRACT
         place = {"type": "translation", "translation": [0.0, *(origin + size * (factor - 1) / 2).tolist()]}
         datasets.append({"path": str(level), "coordinateTransformations": [scale, place]})
     image = {"version": "0.4", "name": "refractive index", "axes": axes, "datasets": datasets, "type": "mean"}
-    channels = [
-        {"label": name, "color": colour, "active": name != "beta", "window": _window(low, high)}
-        for name, colour, (low, high) in zip(of.units, COLOURS, limits.tolist())
-    ]
+    channels = []
+    for name, colour, (low, high) in zip(of.units, COLOURS, limits.tolist()):
+        high = high if high > low else low + 1.0  # a range of grey values is never empty
+        window = {"min": low, "max": high, "start": low, "end": high}
+        channels.append({"label": name, "color": colour, "active": name != "beta", "window": window})
     return {"multiscales": [image], "omero": {"version": "0.4", "channels": channels}}
-
-
-def _window(low: float, high: float) -> dict[str, float]:
-    """The range of grey values, which is never empty."""
-    high = high if high > low else low + 1.0
-    return {"min": low, "max": high, "start": low, "end": high}
 
 
 def _array(group: Any, name: str, shape: tuple[int, int, int]) -> Any:
@@ -223,13 +212,3 @@ def _array(group: Any, name: str, shape: tuple[int, int, int]) -> Any:
         fill_value=0.0,
         chunk_key_encoding={"name": "v2", "separator": "/"},
     )
-
-
-def _fill(array: Any, slabs: Iterable[tuple[int, Volume]], limits: np.ndarray, of: Contents) -> None:
-    """Write slabs, and keep their least and greatest values in `limits` [2, 2]."""
-    for start, part in slabs:
-        values = np.stack(list(of.of_volume(part).values()))
-        array[:, :, start : start + values.shape[2]] = values
-        flat = values.reshape(len(NAMES), -1)
-        limits[:, 0] = np.minimum(limits[:, 0], flat.min(axis=1))
-        limits[:, 1] = np.maximum(limits[:, 1], flat.max(axis=1))

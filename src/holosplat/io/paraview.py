@@ -50,9 +50,7 @@ COMPONENTS = re.compile(rb"\bNumberOfComponents\s*=\s*[\"']\s*(\d{1,4})\s*[\"']"
 END = b"\n</AppendedData>\n</VTKFile>\n"
 
 
-def write_vti(
-    path: Path, obj: Object, grid: Grid, on_progress: Advance = lambda fraction: None, of: Contents = REFRACTION
-) -> None:
+def write_vti(path: Path, obj: Object, grid: Grid, on_progress: Advance, of: Contents) -> None:
     """Write δ and β of `obj` on `grid`, slab by slab."""
     head, bytes_each = _head(grid, of), 4 * math.prod(grid.shape)
     starts = [len(head) + 8 + k * (8 + bytes_each) for k in range(len(NAMES))]
@@ -88,10 +86,7 @@ def _head(grid: Grid, of: Contents) -> bytes:
 
 
 def read_vti(path: Path) -> Stored:
-    """The volume of a .vti file with the point data delta and beta, and the field data length_unit, by VTK's reader.
-
-    `InputError` for damaged files, and for other image data.
-    """
+    """The volume of a .vti file with point data delta, beta and field data length_unit; `InputError` for others."""
     from vtkmodules.vtkIOXML import vtkXMLImageDataReader
 
     _require_honest(path)
@@ -104,7 +99,8 @@ def read_vti(path: Path) -> Stored:
     data, unit = image.GetPointData(), image.GetFieldData().GetAbstractArray(UNIT)
     of = contents_of(_names(data))
     arrays = [data.GetArray(name) for name in of.units]
-    if unit is None or unit.GetNumberOfValues() != 1 or any(_is_none(one, image) for one in arrays):
+    sizes = [None if one is None else (one.GetNumberOfComponents(), one.GetNumberOfTuples()) for one in arrays]
+    if unit is None or unit.GetNumberOfValues() != 1 or sizes != [(1, image.GetNumberOfPoints())] * 2:
         raise InputError(
             f"{path} must have the point data delta and beta, a number a point, and the field data {UNIT}, as "
             f"`holosplat export` writes them, but it has the point data {_names(data)} and the field data "
@@ -140,10 +136,6 @@ def _require_honest(path: Path) -> None:
         points = math.prod(1 + int(high) - int(low) for low, high in bounds)
         require_declared(str(path), 4 * points * components, len(content))
         require_memory(str(path), 4 * points * components)
-
-
-def _is_none(array: Any, image: Any) -> bool:
-    return array is None or array.GetNumberOfComponents() != 1 or array.GetNumberOfTuples() != image.GetNumberOfPoints()
 
 
 def _names(data: Any) -> str:
@@ -183,17 +175,15 @@ def write_vtu(path: Path, bodies: Sequence[TriangleMesh], matter: Sequence[Matte
 
 @dataclass(frozen=True)
 class TimeStep:
-    """The files, one a body, of one instant `time` [s]."""
+    """The files, one a body in the order of their names, of one instant `time` [s]."""
 
     time: float
     files: tuple[Path, ...]
 
 
 def write_pvd(path: str | Path, steps: Sequence[TimeStep]) -> None:
-    """Write the collection `path` of `steps`; files are named relative to its folder, so that it can move with them.
-
-    `InputError` for a time that is not finite, and for legacy files.
-    """
+    """Write the collection `path`, with files relative to its folder; `InputError` for infinite times and legacy
+    files."""
     folder = Path(path).resolve().parent
     lines = ['<?xml version="1.0"?>', '<VTKFile type="Collection" version="0.1">', "  <!-- timestep in seconds -->"]
     lines.append("  <Collection>")
@@ -212,11 +202,8 @@ def write_pvd(path: str | Path, steps: Sequence[TimeStep]) -> None:
 
 
 def read_pvd(path: str | Path) -> list[TimeStep]:
-    """The instants of a collection in the order of time, the files of each in the order of their parts.
-
-    `InputError` where the file is missing, is no collection, names no files or files that do not exist, or has no time
-    for one.
-    """
+    """The instants of a collection in the order of time, files in the order of parts. Errors: `InputError` for a
+    missing or other file, for missing files in it, and for none or no time."""
     require_regular(path, "a ParaView collection (.pvd)")
     try:
         root = ElementTree.fromstring(Path(path).read_bytes())
@@ -248,17 +235,9 @@ HEADER_TIME = re.compile(r"\bt(?:ime)?\s*=\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*([
 COLLECTION = ".pvd"
 
 
-@dataclass(frozen=True)
-class Snapshot:
-    """The files of all bodies, in the order of their names, at `time` [s]."""
-
-    time: float
-    files: tuple[Path, ...]
-
-
 def find_snapshots(
     paths: Sequence[Path], interval: float | None = None, time_unit: str | None = None
-) -> list[Snapshot]:
+) -> list[TimeStep]:
     """Snapshots in the order of time, all of the same bodies.
 
     paths: one collection (.pvd), or numbered mesh files and folders of them. The times are `interval` [s] apart, if it
@@ -278,18 +257,29 @@ def find_snapshots(
         factor = unit_factor("time unit", time_unit or "s", TIME_UNITS)
         said = {key: key * factor for key in listed}
     else:
-        listed, said = _by_number(mesh_files(paths)), {}
+        listed, said = dict[float, list[Path]](), {}
+        for file in mesh_files(paths):
+            if (match := NUMBERED.fullmatch(file.stem)) is None:
+                raise InputError(
+                    f"{file} must end with the number of its snapshot, such as cell00_007.vtk, to be part of a series."
+                )
+            listed.setdefault(float(match["number"]), []).append(file)
     keys = sorted(listed)
     ordered = [_in_order(listed[key]) for key in keys]
     for bodies in ordered[1:]:
-        _require_same_bodies(ordered[0], bodies)
+        if lost := sorted(ordered[0].keys() ^ bodies.keys()):
+            has, lacks = (ordered[0], bodies) if lost[0] in ordered[0] else (bodies, ordered[0])
+            raise InputError(
+                f"every snapshot must hold the same bodies, but {has[lost[0]].name} has no match beside "
+                f"{next(iter(lacks.values())).name}; add it, or leave the snapshot out."
+            )
     if interval is not None:
         step = positive("snapshot interval", interval, "seconds")
         counts = np.arange(len(keys)) if collections else np.array(keys) - keys[0]
         times = [float(step * count) for count in counts]
     else:
         times = [_time(list(bodies.values()), said.get(key)) for key, bodies in zip(keys, ordered)]
-    found = [Snapshot(time, tuple(bodies.values())) for time, bodies in zip(times, ordered)]
+    found = [TimeStep(time, tuple(bodies.values())) for time, bodies in zip(times, ordered)]
     for before, after in pairwise(found):
         require(
             after.time > before.time,
@@ -300,10 +290,7 @@ def find_snapshots(
 
 
 def seeming_snapshots(paths: Sequence[Path]) -> int:
-    """How many snapshots mesh files seem to be of, by their names alone: two bodies or more, each with all the numbers.
-
-    1 where they do not.
-    """
+    """How many snapshots the names of mesh files say: of two bodies or more, each with all the numbers; else 1."""
     numbers: dict[str, set[int]] = {}
     for file in mesh_files(paths):
         if (match := NUMBERED.fullmatch(file.stem)) is None:
@@ -311,18 +298,6 @@ def seeming_snapshots(paths: Sequence[Path]) -> int:
         numbers.setdefault(match["body"], set()).add(int(match["number"]))
     first, *others = numbers.values()
     return len(first) if others and all(other == first for other in others) else 1
-
-
-def _by_number(files: list[Path]) -> dict[float, list[Path]]:
-    found: dict[float, list[Path]] = {}
-    for file in files:
-        match = NUMBERED.fullmatch(file.stem)
-        if match is None:
-            raise InputError(
-                f"{file} must end with the number of its snapshot, such as cell00_007.vtk, to be part of a series."
-            )
-        found.setdefault(float(match["number"]), []).append(file)
-    return found
 
 
 def _in_order(files: list[Path]) -> dict[str, Path]:
@@ -337,24 +312,12 @@ def _in_order(files: list[Path]) -> dict[str, Path]:
     return dict(sorted(bodies.items()))
 
 
-def _require_same_bodies(first: dict[str, Path], other: dict[str, Path]) -> None:
-    if lost := sorted(first.keys() ^ other.keys()):
-        body = lost[0]
-        has, lacks = (first, other) if body in first else (other, first)
-        raise InputError(
-            f"every snapshot must hold the same bodies, but {has[body].name} has no match beside "
-            f"{next(iter(lacks.values())).name}; add it, or leave the snapshot out."
-        )
-
-
 def _time(files: list[Path], said: float | None) -> float:
     """Time [s] of one snapshot, from its files' headers, or else from the collection."""
     times = {_header_time(file) for file in files}
     if len(times) > 1:
         raise InputError(f"the files of one snapshot must be of one time, but {files[0].name} and others differ.")
-    (time,) = times
-    if time is None:
-        time = said
+    time = said if (found := times.pop()) is None else found
     if time is None:
         raise InputError(f"{files[0]} does not say its time (t=17.7us in the second line); give --snapshot-interval.")
     return time

@@ -21,10 +21,8 @@ UNITS = {"phase": "rad", "thickness": "m", "light": "relative intensity"}
 
 @dataclass(frozen=True)
 class PhaseMaps:
-    """Maps [V, H, W] of V frames, by name: phase [rad], and perhaps thickness [m] and light (relative intensity).
-
-    exposures: how the frames were taken; facts: material, method and what else is to be known, as texts
-    """
+    """Maps [V, H, W] of V frames by name: phase [rad], perhaps thickness [m] and light (relative); exposures of the
+    frames; facts: texts on material, method and the like."""
 
     maps: Mapping[str, np.ndarray]
     exposures: Exposures
@@ -45,17 +43,25 @@ def is_file(path: Path) -> bool:
 
 def write_phase_maps(path: Path, found: PhaseMaps) -> None:
     """Write an HDF5 file if `path` ends on .h5 or .hdf5, else a folder: a TIFF stack a map (float32), and maps.json."""
+    exposures, views = found.exposures, found.exposures.views
+    pixels = views.pixel_size if views.has_one_pixel else views.pixel_sizes
     if is_file(path):
-        _write_hdf5(path, found)
+        with new_hdf5(path, sum(4 * images.size for images in found.maps.values())) as file:
+            file.attrs["format"] = FORMAT
+            file.attrs.update(found.facts)
+            arrays = {name: (images.astype(np.float32), UNITS[name]) for name, images in found.maps.items()}
+            numbers = {"pixel_size": (pixels, "m"), "distance": (exposures.distance, "m")}
+            for name, (values, unit) in (arrays | numbers | {"energy": (exposures.energy_kev, "keV")}).items():
+                put(file, name, values).attrs["units"] = unit
+            put(file, "rotations", views.rotations)
         return
     import tifffile
 
-    exposures = found.exposures
     table = {
         "format": FORMAT,
         "maps": {name: {"file": f"{name}.tif", "unit": UNITS[name]} for name in found.maps},
         "facts": dict(found.facts),
-        "pixel_size_m": np.asarray(_pixels(exposures)).tolist(),
+        "pixel_size_m": np.asarray(pixels).tolist(),
         "energy_kev": exposures.energy_kev.tolist(),
         "frames": [exposure_table(exposures, n) for n in range(len(exposures))],
     }
@@ -65,26 +71,3 @@ def write_phase_maps(path: Path, found: PhaseMaps) -> None:
             text = f"{name}, {UNITS[name]}".encode()
             tifffile.imwrite(folder / f"{name}.tif", images.astype(np.float32), description=text, **how)
         write_json(folder / "maps.json", table)
-
-
-def _pixels(exposures: Exposures) -> float | np.ndarray:
-    """The pixel size [m] of all maps, or [V] where they have several."""
-    views = exposures.views
-    return views.pixel_size if views.has_one_pixel else views.pixel_sizes
-
-
-def _write_hdf5(path: Path, found: PhaseMaps) -> None:
-    exposures = found.exposures
-    with new_hdf5(path, sum(4 * images.size for images in found.maps.values())) as file:
-        file.attrs["format"] = FORMAT
-        file.attrs.update(found.facts)
-        for name, images in found.maps.items():
-            put(file, name, images.astype(np.float32)).attrs["units"] = UNITS[name]
-        numbers = {
-            "pixel_size": (_pixels(exposures), "m"),
-            "distance": (exposures.distance, "m"),
-            "energy": (exposures.energy_kev, "keV"),
-        }
-        for name, (values, unit) in numbers.items():
-            put(file, name, values).attrs["units"] = unit
-        put(file, "rotations", exposures.views.rotations)

@@ -38,17 +38,10 @@ LENGTH_UNIT = "um"
 
 
 def fill(
-    places: Sequence[tuple[BinaryIO, int]],
-    obj: Object,
-    grid: Grid,
-    on_progress: Advance = lambda fraction: None,
-    of: Contents = REFRACTION,
+    places: Sequence[tuple[BinaryIO, int]], obj: Object, grid: Grid, on_progress: Advance, of: Contents
 ) -> np.ndarray:
-    """Write δ and β of `obj` on `grid`, or what else is `of` it, at `places`: for each an open file and the byte where
-    its values begin.
-
-    Returns their least and greatest values, means and standard deviations [2, 4].
-    """
+    """Write δ and β of `obj` on `grid`, or what else is `of` it, at `places`: open files and the bytes where values
+    begin. Returns least and greatest values, means and standard deviations [2, 4]."""
     _, y, x = grid.shape
     found = np.array([[np.inf, -np.inf, 0.0, 0.0]] * len(NAMES))
     for start, part in slabs_of(obj, grid, slab_rows(grid), on_progress):
@@ -89,10 +82,8 @@ def both(path: Path) -> tuple[Path, Path]:
 def write_both(
     path: Path, head: Callable[[str, np.ndarray], bytes], obj: Object, grid: Grid, on_progress: Advance, of: Contents
 ) -> None:
-    """Write δ and β of `obj` on `grid` into two files (`both`), of which each begins with `head`.
-
-    head: from the name of the array and its least and greatest value, mean and standard deviation [4]; of one length.
-    """
+    """Write δ and β of `obj` on `grid` into two files (`both`), each behind a `head` of one length, made from the
+    array's name and its least and greatest value, mean and standard deviation [4]."""
     unknown = np.zeros(4)
     require_room(path, len(NAMES) * (len(head(next(iter(of.units)), unknown)) + 4 * math.prod(grid.shape)))
     with ExitStack() as stack:
@@ -152,9 +143,7 @@ FIELD = re.compile(r"([^:#]+): (.*)")
 """A field of a header; comments begin with #, keys of other programs stand before :=."""
 
 
-def write_nrrd(
-    path: Path, obj: Object, grid: Grid, on_progress: Advance = lambda fraction: None, of: Contents = REFRACTION
-) -> None:
+def write_nrrd(path: Path, obj: Object, grid: Grid, on_progress: Advance, of: Contents) -> None:
     """Write δ and β of `obj` on `grid` into two files, slab by slab."""
     size, origin = micrometres(grid)
     steps = [[size[axis] if axis == k else 0.0 for k in range(3)] for axis in range(3)]
@@ -181,15 +170,8 @@ def _vector(numbers: list[float]) -> str:
     return f"({','.join(map(repr, numbers))})"
 
 
-def read_nrrd(path: Path) -> Stored:
-    """The volume of NAME.nrrd and NAME.beta.nrrd, of numbers float or double, raw or gzip, axes that are not turned.
-
-    `InputError` for other NRRD files, and for values in a further file.
-    """
-    return read_both(path, _read_one_nrrd)
-
-
-def _read_one_nrrd(path: Path) -> tuple[np.ndarray, Grid, Contents]:
+def read_nrrd(path: Path) -> tuple[np.ndarray, Grid, Contents]:
+    """One array of NRRD: float or double, raw or gzip, axes not turned; `InputError` for other files."""
     with path.open("rb") as file:
         head, found, _ = file.read(LONGEST).partition(b"\n\n")
     require(
@@ -276,9 +258,7 @@ STAMPS = {b"DD": "<", b"DA": "<", b"\x11\x11": ">"}
 """Byte order by the first two bytes of the stamp."""
 
 
-def write_mrc(
-    path: Path, obj: Object, grid: Grid, on_progress: Advance = lambda fraction: None, of: Contents = REFRACTION
-) -> None:
+def write_mrc(path: Path, obj: Object, grid: Grid, on_progress: Advance, of: Contents) -> None:
     """Write δ and β of `obj` on `grid` into two files, slab by slab."""
 
     def head(name: str, statistics: np.ndarray) -> bytes:
@@ -295,15 +275,8 @@ def write_mrc(
     write_both(path, head, obj, grid, on_progress, of)
 
 
-def read_mrc(path: Path) -> Stored:
-    """The volume of NAME.mrc and NAME.beta.mrc, single volumes of float32.
-
-    `InputError` for other MRC files. Lengths come back to seven digits, which the header has of them.
-    """
-    return read_both(path, _read_one_mrc)
-
-
-def _read_one_mrc(path: Path) -> tuple[np.ndarray, Grid, Contents]:
+def read_mrc(path: Path) -> tuple[np.ndarray, Grid, Contents]:
+    """One array of MRC2014, of float32, lengths to seven digits; `InputError` for other files."""
     with path.open("rb") as file:
         raw = file.read(HEADER.itemsize).ljust(HEADER.itemsize, b"\0")
     head = np.frombuffer(raw, HEADER)[0]

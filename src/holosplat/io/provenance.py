@@ -23,8 +23,8 @@ from typing import Any
 from ..checks import require
 from ..tables import read_table, table_in
 from ..version import __version__, source_commit
-from .leftovers import LOCK, clear_leftovers, files_in, flushed, is_begun, is_left, temporary_name
-from .leftovers import RECORD as NAME
+from .lock import LOCK, clear_leftovers, files_in, flushed, is_begun, is_left, temporary_name
+from .lock import RECORD as NAME
 
 ATTRIBUTE = "provenance"
 RECORDS, MADE = "records", "made"
@@ -58,23 +58,18 @@ class Command:
 
     _hashed: dict[tuple[Path, ...], dict[str, Any]] = field(default_factory=dict)
 
-    def _fingerprints(self, near: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
-        """The inputs with their hashes, as they were when the first file was written, but for folders that hold
-        `near`."""
-        for _, group in groupby(self.inputs, key=lambda one: one[0]):
-            paths = [path for _, path in group if Path(os.path.realpath(path)) not in (near, *near.parents)]
-            for few in [(path,) for path in paths] if len(paths) <= MOST_NAMED else [(*paths,)]:
-                if few not in self._hashed:
-                    self._hashed[few] = ({"files": len(few)} if len(few) > 1 else {}) | fingerprint(*few)
-                yield next(iter(few)), self._hashed[few]
-
     def record(self, near: Path) -> dict[str, Any]:
         """What is said of this command in the folder `near`, from which inputs are named, too."""
-        inputs = []
-        for path, said in self._fingerprints(near):
-            place = self.folder / path
-            relative = {} if _is_private(place, near) else {"relative": os.path.relpath(place, near)}
-            inputs.append({"path": home_safe(str(path)), **relative, **said})
+        inputs, home = [], Path.home()
+        for _, group in groupby(self.inputs, key=lambda one: one[0]):
+            paths = [path for _, path in group if Path(os.path.realpath(path)) not in (near, *near.parents)]
+            for few in [[path] for path in paths] if len(paths) <= MOST_NAMED else [paths]:
+                if (key := tuple(few)) not in self._hashed:  # as they were when the first file was written
+                    self._hashed[key] = ({"files": len(few)} if len(few) > 1 else {}) | fingerprint(*few)
+                place = Path(os.path.abspath(self.folder / few[0]))
+                names_home = home in place.parents and home not in (near, *near.parents)  # as the way from `near` would
+                relative = {} if names_home else {"relative": os.path.relpath(place, near)}
+                inputs.append({"path": home_safe(str(few[0])), **relative, **self._hashed[key]})
         words = " ".join(map(_quoted, ["holosplat", *self.words]))
         said = {"command": words, "folder": home_safe(str(self.folder)), "inputs": inputs}
         return {**_program(), **said, **({"decided": self.decided} if self.decided else {})}
@@ -156,8 +151,7 @@ def leave_record(path: Path, made: Path) -> None:
 
 
 def records(folder: Path) -> list[dict[str, Any]]:
-    """What provenance.json of a folder says of each command that wrote there, the first one first; nothing where there
-    is none, or another program's."""
+    """The record of each command that wrote to a folder, the first one first; nothing where there is none of ours."""
     with suppress(*GARBLED):
         return [dict(each) for each in read_table(folder / NAME)[RECORDS]]
     return []
@@ -178,10 +172,8 @@ def origin(path: Path) -> dict[str, Any]:
 
 
 def fingerprint(*paths: Path) -> dict[str, Any]:
-    """Bytes and SHA-256 of a file; of folders, and of several files, that of the hashes of all their files in order.
-
-    Of more than `MOST_BYTES`, it is of the beginnings and ends of files, and called `sha256_of_ends`.
-    """
+    """Bytes and SHA-256 of a file, or of the hashes of all files of folders in order; beyond `MOST_BYTES` of the
+    beginnings and ends of files (`sha256_of_ends`)."""
     try:
         files = [file for path in paths for file in ([path] if path.is_file() else files_in(path))]
         states = [file.stat() for file in files]
@@ -239,15 +231,8 @@ def _quoted(word: str) -> str:
     return f"~/{shlex.quote(safe[2:])}" if safe.startswith("~/") and safe != word else shlex.quote(safe)
 
 
-def _is_private(path: Path, near: Path) -> bool:
-    """Whether a way from `near` to `path` would name one's home."""
-    home, there = Path.home(), Path(os.path.abspath(path))
-    return home in there.parents and home not in (near, *near.parents)
-
-
 def _folder_of(path: Path, command: Command) -> Path | None:
-    """The folder to which a file or folder belongs: one that the command makes, or that commands have made; None for
-    what stands by itself."""
+    """The folder, made by this command or an earlier one, to which a file belongs; None for what stands by itself."""
     outputs = [Path(os.path.realpath(out)) for out in command.outputs]
     for folder in path.parents:
         if folder in outputs or (folder / LOCK).exists():

@@ -14,17 +14,17 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import InputError, UnsaidError, at_least, finite, in_range, positive, require, shaped
+from ..checks import InputError, finite, in_range, positive, require, shaped
 from ..geometry import Grid, Views
-from ..ranges import checked_dataclass
+from ..ranges import Natural, checked_dataclass
 from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, Scan
 from ..units import wavenumber
 from ..volume import Volume
 from .atomic import atomic_folder, write_json
 from .guard import read_array
 from .nerf_synthetic import hull_points
-from .raw_file import Loader, folder_with, stand_in
-from .table import Table, beam_table, exposure_table, in_order, read_exposures
+from .raw_file import Loader, folder_with, require_said
+from .table import Table, beam_table, exposure_table, read_own_exposures
 
 FORMAT = "holosplat R2-Gaussian 1"
 META = "meta_data.json"
@@ -41,11 +41,8 @@ class R2Options:
 
     truth: Volume | None = None
     """The true volume, with which that program scores its reconstruction (default: zeros)."""
-    seed_points: int = 50_000
+    seed_points: Natural = 50_000
     """Number of points to start from."""
-
-    def __post_init__(self) -> None:
-        at_least(self, 1, "seed_points")
 
 
 @dataclass(frozen=True)
@@ -84,7 +81,17 @@ def write_r2_gaussian(
     shaped("thickness", finite("thickness", thickness), scan.frames.shape)
     positive("delta", delta)
     views, square = scan.views, _Square(scan.views.shape)
-    _require_one_axis(views)
+    require(
+        views.shares_axis,
+        "R²-Gaussian has one angle a view about one axis, but these views turn about others or shift along it; "
+        "choose another format.",
+    )
+    aside = np.abs(views.shifts[:, 0]).max() / views.pixel_size
+    require(
+        bool(aside < 1e-3),
+        f"R²-Gaussian has its rotation axis in the middle of the detector, but it lies up to {aside:.3g} pixels "
+        "beside it (shifts); resample the frames first.",
+    )
     unit = 0.5 * square.side * views.pixel_size
     meta = _meta(scan, square, unit, delta)
     train = np.flatnonzero(~scan.is_test)
@@ -109,11 +116,8 @@ def write_r2_gaussian(
 
 
 def read_r2_gaussian(path: str | Path, energy_kev: float | None = None, pixel_size: float | None = None) -> Scan:
-    """A folder of R²-Gaussian as a scan: frames `exp(-p)` of its line integrals p, in contact with the detector.
-
-    There is no phase in such data: one density in the scene's unit is an absorber with μ = 1 per unit, β = μ / 2k.
-    energy_kev and pixel_size [m]: needed for folders of other programs, which do not say.
-    """
+    """A folder of R²-Gaussian as frames `exp(-p)` of line integrals p, in contact: a density of 1 is an absorber with μ
+    = 1 per unit of length, β = μ / 2k. energy_kev, pixel_size [m]: for folders of other programs."""
     meta = Table.read(Path(path) / META)
     own = "holosplat" in meta
     given = energy_kev is not None or pixel_size is not None
@@ -131,9 +135,9 @@ def read_r2_gaussian(path: str | Path, energy_kev: float | None = None, pixel_si
     is_test = np.arange(len(entries)) >= len(splits[0])
     if own:
         return _own_scan(meta, entries, lines, is_test)
-    if energy_kev is None or pixel_size is None:
-        said = f"{path} does not say its photon energy and pixel size; give both, by --energy-kev and --pixel-size."
-        raise UnsaidError(said, stand_in(*TAKES))
+    require_said(str(path), TAKES if energy_kev is None or pixel_size is None else ())
+    assert energy_kev is not None
+    assert pixel_size is not None
     in_range("energy", energy_kev, *ENERGY_RANGE_KEV, unit="keV")
     in_range("pixel size", pixel_size, *PIXEL_RANGE_M, unit="metres")
     angles = [entry.number("angle") for entry in entries]
@@ -141,20 +145,6 @@ def read_r2_gaussian(path: str | Path, energy_kev: float | None = None, pixel_si
     views = Views.from_angles(np.rad2deg(angles), (h, w), pixel_size)
     unit = pixel_size / _pitch(scanner, (h, w))
     return _absorber(lines, Exposures.of(views, energy_kev, 0.0), is_test, unit, {})
-
-
-def _require_one_axis(views: Views) -> None:
-    require(
-        views.shares_axis,
-        "R²-Gaussian has one angle a view about one axis, but these views turn about others or shift along it; "
-        "choose another format.",
-    )
-    aside = np.abs(views.shifts[:, 0]).max() / views.pixel_size
-    require(
-        bool(aside < 1e-3),
-        f"R²-Gaussian has its rotation axis in the middle of the detector, but it lies up to {aside:.3g} pixels "
-        "beside it (shifts); resample the frames first.",
-    )
 
 
 def _angle(views: Views, n: int) -> float:
@@ -212,10 +202,8 @@ def _projections(entries: list[Table], shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _pitch(scanner: Table, shape: tuple[int, int]) -> float:
-    """The pixels' edge in the file's unit of length; `InputError` for geometries that its two readers take differently.
-
-    In parallel beam its rasteriser spreads the image over the volume's cube and knows no offset.
-    """
+    """The pixels' edge in the file's unit of length; `InputError` unless the detector covers the volume's cube without
+    an offset: the layout's two readers take other geometries differently."""
     edges = scanner.numbers("sDetector", (2,)) / shape
     cube = scanner.numbers("sVoxel", (3,)).max()
     even = bool(np.allclose(edges, edges[0], rtol=1e-3) and np.allclose(edges * shape, cube, rtol=1e-3))
@@ -237,9 +225,7 @@ def _own_scan(meta: Table, entries: list[Table], lines: np.ndarray, is_test: np.
     (top, left), (h, w) = ours.counts("corner", (2,)), ours.counts("shape", (2,))
     fits = h > 0 and w > 0 and top + h <= lines.shape[1] and left + w <= lines.shape[2]
     require(fits, f"{ours.label('shape')} must lie within the projections, but it is ({h}, {w}) at ({top}, {left}).")
-    frames = [entry.table("holosplat") for entry in entries]
-    order = in_order(ours, frames)
-    exposures = read_exposures(ours, [frames[k] for k in order], (h, w))
+    order, exposures = read_own_exposures(ours, entries, (h, w))
     contact = replace(exposures, distance=np.array(0.0), psf_sigma_px=np.array(0.0))
     cut = lines[order, top : top + h, left : left + w]
     return _absorber(

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -14,12 +14,9 @@ from ..checks import UnsaidError, in_range, note, require
 from ..divided_light import DividedLight
 from ..geometry import Views, rotation_y
 from ..preprocess.pixels import mean_frame
-from ..scan import DISTANCE_RANGE_M, PIXEL_RANGE_M, Exposures, checked_distance
+from ..scan import DISTANCE_RANGE_M, PIXEL_RANGE_M, Exposures, Scan, checked_distance
 from ..units import BEAM_RANGE_KEV
 from .stacks import ImageStack
-
-if TYPE_CHECKING:
-    from ..scan import Scan
 
 PROJECTION, FLAT, DARK, INVALID = range(4)
 
@@ -55,32 +52,6 @@ class Stack(Protocol):
     def __getitem__(self, index: Any, /) -> Any: ...
 
 
-def rows_of(
-    stacks: Sequence[Stack],
-    number: int,
-    rows: slice,
-    flips: tuple[bool, bool] = (False, False),
-    are_counts: bool = True,
-) -> np.ndarray:
-    """The rows `rows` (from start to stop) of frame `number` of stacks that follow each other, float64, turned upright.
-
-    flips: whether the stored frames are upside down, and mirrored left to right; are_counts: whether whole numbers are
-    those of a camera, whose greatest one stands for more light than it counts, or marks a gap: it becomes NaN.
-    """
-    for stack in stacks:
-        if number < stack.shape[0]:
-            upside_down, mirrored = flips
-            height = stack.shape[1]
-            stored = slice(height - rows.stop, height - rows.start) if upside_down else rows
-            values = np.asarray(stack[number, stored])
-            found = values.astype(np.float64)
-            if are_counts and values.dtype.kind in "iu":
-                found[values == np.iinfo(values.dtype).max] = np.nan
-            return found[:: -1 if upside_down else 1, :: -1 if mirrored else 1]
-        number -= stack.shape[0]
-    raise IndexError(number)
-
-
 @dataclass(frozen=True)
 class ScanFile:
     """A file that is open: how its n projections were taken, and its N frames of all kinds, read one by one.
@@ -94,7 +65,7 @@ class ScanFile:
     texts: the provenance.
     has_given_fields: whether flats and darks that are said beside it are among its frames already.
     divided: what is not known of light that its projections were divided by, if it says so.
-    are_counts: whether frames of whole numbers are those of a camera (`rows_of`).
+    are_counts: whether frames of whole numbers are those of a camera (`rows`).
     """
 
     path: Path
@@ -147,8 +118,20 @@ class ScanFile:
         return self.rows(number, slice(0, self.exposures.views.shape[0]))
 
     def rows(self, number: int, rows: slice) -> np.ndarray:
-        """The rows `rows` (from start to stop) of frame `number`, float64, turned upright."""
-        return rows_of(self.stacks, int(number), rows, self.flips, self.are_counts)
+        """The rows `rows` (from start to stop) of frame `number`, float64, turned upright; the greatest whole number of
+        a camera, which stands for more light than it counts, or marks a gap, is NaN."""
+        upside_down, mirrored = self.flips
+        height = self.exposures.views.shape[0]
+        stored = slice(height - rows.stop, height - rows.start) if upside_down else rows
+        for stack in self.stacks:
+            if number < stack.shape[0]:
+                values = np.asarray(stack[int(number), stored])
+                found = values.astype(np.float64)
+                if self.are_counts and values.dtype.kind in "iu":
+                    found[values == np.iinfo(values.dtype).max] = np.nan
+                return found[:: -1 if upside_down else 1, :: -1 if mirrored else 1]
+            number -= stack.shape[0]
+        raise IndexError(number)
 
     def mean(self, kind: int) -> np.ndarray:
         """The mean [H, W] of the frames of `kind`; zeros where there are none."""
@@ -217,10 +200,8 @@ def magnified(
 
 
 def with_rays(views: Views, source: float | None) -> Views:
-    """The views, whose pixels are those at the sample, with the rays of a point source [m] before it (None: far away).
-
-    Up to a tangent of `WIDEST` of half the cone's angle they are taken for parallel.
-    """
+    """The views with the rays of a point source [m] before the sample, if these are a wide cone (`WIDEST`); None: far
+    away."""
     if source is None or 0.5 * float(views.fields.max()) <= WIDEST * source:
         return views
     return replace(views, sources=np.full(len(views), source))
@@ -289,10 +270,8 @@ def exposures_of(
 
 
 def together(label: str, parts: Sequence[tuple[int, Stack | None]]) -> tuple[tuple[Stack, ...], np.ndarray]:
-    """Stacks of one kind each as the frames of one file: the stacks, and the kinds [N] of all frames.
-
-    Errors: `InputError` for stacks that are not [n, H, W], or of another size than the first.
-    """
+    """Stacks of one kind each, and the kinds [N] of all frames; `InputError` for stacks that are not [n, H, W]
+    alike."""
     stacks: list[Stack] = []
     kinds: list[int] = []
     for kind, stack in parts:

@@ -48,27 +48,23 @@ class Told:
     source_distance: Positive | None = None
     """Distance from a point source to the sample [m]; distance and pixel are then those of the detector itself."""
     bandwidth: float | str | None = None
-    """Relative full width at half maximum ΔE/E of the spectrum, or a range LOW:HIGH for `reconstruct` (default: as the
-    files say, or 0)."""
+    """Relative full width at half maximum ΔE/E of the spectrum, or a range LOW:HIGH (default: the files', or 0)."""
     source_size: float | str | None = None
-    """Standard deviation of the source [m], whose blur joins that of the detector, or such a range; with
-    --source-distance."""
+    """Standard deviation of the source [m], which adds to the blur, or such a range; with --source-distance."""
     psf_sigma_px: float | str | None = None
     """Standard deviation of the detector's blur [pixels], or such a range (default: as the files say, or 0)."""
     angles: Path | None = None
-    """Text file of the frames' angles [degrees], one a line, or in a column that its first line names (default: as the
-    files say)."""
+    """Text file of the frames' angles [degrees]: one a line, or a named column (default: as the files say)."""
     exposures: Path | None = None
-    """geometry.toml of the beams, as align and calibrate write it, which goes before what files say: a view for each
-    frame, or for each frame of every time (default: as the files say)."""
+    """geometry.toml of align or calibrate, which overrides the files: a view for each frame, or for each frame of every
+    time (default: as the files say)."""
     flats: Path | None = None
-    """Images without the object: a file (TIFF, PNG, HDF5, .npy, .npz) or a folder of images (default: as the files have
-    them)."""
+    """Images without the object: TIFF, PNG, HDF5, .npy or .npz, or a folder of images (default: the files' own)."""
     darks: Path | None = None
     """Images without light, likewise."""
     leave_out: str | None = None
-    """Frames to leave out, flats and darks too, counted from 0 as they stand in the files, as --views; those of --flats
-    and --darks follow (default: flats and darks that are unlike the others)."""
+    """Frames to leave out, counted from 0 in the files, as --views; those of --flats and --darks follow (default: odd
+    flats and darks)."""
     files: str | None = None
     """Of a folder of images: the names of the projections, such as 'raw_*.tif' (default: all but flat* and dark*)."""
     entry: str | None = None
@@ -84,26 +80,21 @@ class Told:
     frame_rate: Frequency | None = None
     """European XFEL: frames a second that the camera takes within a train [Hz]."""
     axis_column: Signed | None = None
-    """Column of the rotation axis in the files' frames, 0 the middle of the first one (default: as the files say, or
-    the middle)."""
+    """Column of the rotation axis in the files' frames, the first being 0 (default: the files', or the middle)."""
     sense: Sense = "clockwise"
     """How the object turns as the angle grows, seen from above (row 0 at the top, the beam going away)."""
     tube: str | None = None
-    """INNER:OUTER:ATTENUATION of a tube about the axis whose wall is divided out: its diameters [m] and µ [1/m], such
-    as 4e-3:4.5e-3:200."""
+    """Tube about the axis to divide out, INNER:OUTER:ATTENUATION: diameters [m] and µ [1/m], as in 4e-3:4.5e-3:200."""
     wall: str | None = None
-    """What matter lies in, which is then part of the model: tube:INNER:OUTER:MATERIAL:FILLING (diameters [m]), or
-    cuvette: (WIDTHxDEPTH each), or slab:INNER:MATERIAL:FILLING beyond the field, such as tube:4e-5:5e-5:glass:water."""
+    """Container, modelled with the matter: tube:INNER:OUTER:MATERIAL:FILLING (diameters [m]), cuvette: (WIDTHxDEPTH
+    each), or slab:INNER:MATERIAL:FILLING beyond the field; for instance tube:4e-5:5e-5:glass:water."""
     black: Signed | None = None
     """Grey images, nerf-synthetic: intensity of black pixels, relative to the flat field (default: 0)."""
     white: Signed | None = None
     """Grey images, nerf-synthetic: intensity of white pixels, relative to the flat field (default: 1)."""
 
     def energy(self) -> float | str | None:
-        """The photon energy [keV], or the range of it, that is said: that of the wavelength, if that is said instead.
-
-        Errors: `InputError` for both of them, and for energies that are none of X-rays.
-        """
+        """The photon energy [keV], or its range, also by the wavelength; `InputError` for both, and beyond X-rays."""
         if isinstance(self.energy_kev, float | int):
             from ..scan import ENERGY_RANGE_KEV  # needs geometry, which reading an option does not
 
@@ -143,10 +134,7 @@ class Told:
         return self.source_distance
 
     def given(self, takes: Sequence[str] = ()) -> dict[str, Any]:
-        """The values for a loader, by name (`Loader.takes`); angles as `angles_deg` [N].
-
-        takes: what the loader would take from --exposures, too. Errors: `InputError` for ranges.
-        """
+        """The values for a loader that `takes` such, by name, with `angles_deg` [N]; `InputError` for ranges."""
         for name in self.ranges():
             option, text = f"--{name.replace('_', '-')}", getattr(self, name)
             raise InputError(f"{option} must be one number here, but it is {text!r}; a range is for reconstruct alone.")
@@ -231,25 +219,18 @@ class Part:
 
         Errors: `InputError` for frames, rows, columns or times that the scan does not have.
         """
-        require(self.bin >= 1, f"--bin must be at least 1, but it is {self.bin}.")
-        scan = self._chosen(at_time(self._timed(scan), self.time_frame))
-        if self.crop is not None:
-            scan = scan.cropped(*_corner(self.crop, scan.views.shape))
-        return scan.binned(self.bin)
-
-    def _timed(self, scan: Scan) -> Scan:
-        if self.time_frames is None:
-            return scan
-        instants = scan.instants
-        kept = instants[marked("--time-frames", self.time_frames, len(instants))]
-        return scan[np.flatnonzero(np.isin(scan.exposures.time, kept))]
-
-    def _chosen(self, scan: Scan) -> Scan:
+        if self.time_frames is not None:
+            kept = scan.instants[marked("--time-frames", self.time_frames, len(scan.instants))]
+            scan = scan[np.flatnonzero(np.isin(scan.exposures.time, kept))]
+        scan = at_time(scan, self.time_frame)
         taken = np.ones(len(scan), dtype=bool) if self.views is None else marked("--views", self.views, len(scan))
         if self.test_views is not None:
             held_out = marked("--test-views", self.test_views, len(scan))
             scan, taken = scan.with_split(held_out), taken | held_out
-        return scan if taken.all() else scan[np.flatnonzero(taken)]
+        scan = scan if taken.all() else scan[np.flatnonzero(taken)]
+        if self.crop is not None:
+            scan = scan.cropped(*_corner(self.crop, scan.views.shape))
+        return scan.binned(self.bin)
 
 
 @dataclass(frozen=True)
@@ -301,10 +282,7 @@ class Reading:
 
 
 def told_energy(energy: float | str | None, wavelength: float | None, index: float | None) -> float | str | None:
-    """The photon energy [keV] of the options --energy-kev, --wavelength and --medium-index, of which some are None.
-
-    Errors: `InputError` for an energy beside a wavelength, and for an index without one.
-    """
+    """The photon energy [keV] by energy or wavelength and index; `InputError` for both, and for an index alone."""
     if wavelength is None:
         require(index is None, "--medium-index needs --wavelength, which is shorter in the medium; give both.")
         return energy
@@ -353,10 +331,7 @@ def _corner(text: str, shape: tuple[int, int]) -> tuple[slice, slice]:
 
 
 def marked(option: str, text: str, count: int) -> np.ndarray:
-    """[count] bool: what of `count` the `text` of an option names, numbers and ranges with commas between.
-
-    Errors: `InputError` for what is not there, or is no number.
-    """
+    """[count] bool: the numbers and ranges, with commas, in the `text` of an option; `InputError` for others."""
     found = np.zeros(count, dtype=bool)
     for part in text.split(","):
         if ":" in part:

@@ -19,10 +19,10 @@ def machine_memory() -> int:
 
 
 def free_memory() -> int:
-    """Bytes of memory that this process can still take: what is available on the machine, and what its control group
-    (a container, a cluster's job) and its address space (`ulimit -v`) have left. At least 0."""
+    """Bytes of memory that the machine, control group and address space (`ulimit -v`) leave this process; at least
+    0."""
     left = [*_left(_groups()), *_left(_address_space())]
-    return max(0, min([_entry("meminfo", "MemAvailable") or _physical(), *left]))
+    return max(0, min([1024 * _entry(PROC / "meminfo", "MemAvailable:") or _physical(), *left]))
 
 
 def left_by_limits() -> tuple[int, int]:
@@ -48,13 +48,13 @@ def _physical() -> int:
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
-def _entry(file: str, key: str) -> int:
-    """An entry in kB of a file of /proc, in bytes; 0 where there is none."""
+def _entry(path: Path, key: str) -> int:
+    """The number behind `key` in a file of such lines; 0 where there is none."""
     try:
-        lines = (PROC / file).read_text().splitlines()
+        lines = path.read_text().splitlines()
     except OSError:
         return 0
-    return next((1024 * int(line.split()[1]) for line in lines if line.startswith(f"{key}:")), 0)
+    return next((int(line.split()[1]) for line in lines if line.split()[:1] == [key]), 0)
 
 
 def _groups() -> Iterator[tuple[int, int]]:
@@ -76,8 +76,7 @@ def _groups() -> Iterator[tuple[int, int]]:
 
 
 def _up(top: Path, name: str, limit: str, used: str, cache: str) -> Iterator[tuple[int, int]]:
-    """Limits and uses of the group `name` below `top`, and of all above it. Within a container the group's own name may
-    not be there, but its files stand at the top."""
+    """Limits and uses of the group `name`, and of all above it; in a container its files may stand at the `top`."""
     place = top / name.lstrip("/")
     for folder in (place, *(p for p in place.parents if p == top or top in p.parents)):
         try:
@@ -85,15 +84,7 @@ def _up(top: Path, name: str, limit: str, used: str, cache: str) -> Iterator[tup
         except (OSError, ValueError):  # no such file, or "max"
             continue
         if most < UNLIMITED:
-            yield most, max(0, now - _cached(folder / "memory.stat", cache))
-
-
-def _cached(path: Path, key: str) -> int:
-    try:
-        lines = path.read_text().splitlines()
-    except OSError:
-        return 0
-    return next((int(line.split()[1]) for line in lines if line.split()[:1] == [key]), 0)
+            yield most, max(0, now - _entry(folder / "memory.stat", cache))
 
 
 def _address_space() -> Iterator[tuple[int, int]]:
@@ -104,4 +95,4 @@ def _address_space() -> Iterator[tuple[int, int]]:
         return
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     if limit != resource.RLIM_INFINITY:
-        yield limit, _entry("self/status", "VmSize")
+        yield limit, 1024 * _entry(PROC / "self/status", "VmSize:")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import zipfile
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from pathlib import Path
 from ..checks import InputError, require
 from ..tables import from_table, read_table
 from .atomic import atomic_folder, atomic_path
+from .provenance import sha256 as file_sha256
 
 SAMPLES = Path(__file__).with_name("samples.toml")
 CACHE = "HOLOSPLAT_DATA"
@@ -88,7 +88,7 @@ def _in_folder(wanted: Sample, folder: Path) -> Path:
     found = next((folder / name for name in names if (folder / name).is_file()), None)
     if found is None:
         raise InputError(f"{folder} must hold {' or '.join(names)}, but it does not; check --from.")
-    digest = hashlib.sha256(found.read_bytes()).hexdigest()
+    digest = file_sha256(found)
     require(
         digest == wanted.sha256,
         f"{found} must have the SHA-256 {wanted.sha256[:16]}…, but has {digest[:16]}…: it is damaged or another file.",

@@ -11,19 +11,19 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import h5py
 import numpy as np
 
-from ..checks import InputError, UnsaidError, finite, in_range, require, shaped, warn
+from ..checks import InputError, UnsaidError, in_range, require, shaped, warn
 from ..geometry import Views, rotation_y
 from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, checked_distance
 from ..units import ANGLE_UNITS, BEAM_RANGE_KEV, ENERGY_UNITS, LENGTH_UNITS, PLANCK_TIMES_C_KEV_M, TIME_UNITS
 from .angles import tell_steps
 from .hdf5 import Fields, attribute_text, open_hdf5
 from .light import read_divided_light
-from .nxtomo_geometry import CONE, SHIFT, about_axis, flips_of, magnification, source_before, tell_moves
-from .nxtomo_geometry import FLIPS as FLIPS
+from .nxtomo_geometry import CONE, DATA_NAMES, SHIFT, Entry
 from .raw_file import (
     DARK,
     FLAT,
@@ -38,8 +38,6 @@ from .raw_file import (
     with_rays,
 )
 
-DATA = "instrument/detector/data"
-DATA_NAMES = (DATA, "data/data")
 IMAGE_KEY = "instrument/detector/image_key"
 IMAGE_KEYS = ("instrument/detector/image_key_control", IMAGE_KEY, "data/image_key")
 MASK = "instrument/detector/pixel_mask"
@@ -77,31 +75,47 @@ def open_scan(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Iterator[
     projections only. `InputError` names the file, the dataset, the allowed values and the value found.
     """
     with open_hdf5(path) as file:
-        fields = Fields(Path(path), _entry(file, Path(path), given.get("entry")))
-        kinds = _frame_kinds(fields)
-        _say_unequal_times(fields, kinds)
-        _require_no_two_missing(fields, given)
-        views = _views(fields, kinds, given)
-        psf_sigma = _optional(fields, kinds, PSF_SIGMA, PIXEL_UNITS, "px")
-        time = _optional(fields, kinds, TIME, TIME_UNITS, "s")
-        energy, distance = _energies(fields, kinds, given), _distances(fields, kinds, given)
-        is_test = _split(fields, kinds)
-        require(bool((psf_sigma >= 0).all()), f"{fields.label(PSF_SIGMA)} must not be negative; correct it.")
-        spread = _optional(fields, kinds, ENERGY_SPREAD, ENERGY_UNITS, "keV") / energy
-        exposures = Exposures(views, energy, distance, psf_sigma, time, bandwidth=spread)
-        flips = flips_of(fields)
-        data = fields.need(*DATA_NAMES)
+        group = _scan_group(file, Path(path), given.get("entry"))
+        entry = Entry(Path(path), group, _frame_kinds(Fields(Path(path), group)), given)
+        _say_unequal_times(entry)
+        _require_no_two_missing(entry)
+        views = _views(entry)
+        psf_sigma, time = entry.optional(PSF_SIGMA, PIXEL_UNITS, "px"), entry.optional(TIME, TIME_UNITS, "s")
+        energy, distance = _energies(entry), _distances(entry)
+        split = entry.optional(SPLIT, PIXEL_UNITS, "")
+        wrong = split[~np.isin(split, (0, 1))]
+        require(len(wrong) == 0, f"{entry.label(SPLIT)} must hold 0 (train) or 1 (test), but it holds {wrong[:1]}.")
+        require(bool((psf_sigma >= 0).all()), f"{entry.label(PSF_SIGMA)} must not be negative; correct it.")
+        spread = entry.optional(ENERGY_SPREAD, ENERGY_UNITS, "keV") / energy
+        data, mask = entry.need(*DATA_NAMES), entry.find(*MASKS)
         yield ScanFile(
-            *(Path(path), fields.label(data), (fields.dataset(data),), kinds, exposures, is_test),
-            *(flips, _marked(fields, views.shape), _read_provenance(fields)),
-            fields.label(fields.find(*IMAGE_KEYS) or IMAGE_KEY),
-            divided=read_divided_light(fields, kinds == PROJECTION),
+            entry.path,
+            entry.label(data),
+            (entry.dataset(data),),
+            entry.kinds,
+            Exposures(views, energy, distance, psf_sigma, time, bandwidth=spread),
+            split == 1,
+            entry.flips(),
+            shaped(entry.label(mask), entry.numbers(mask), views.shape) if mask else None,
+            _read_provenance(group),
+            entry.label(entry.find(*IMAGE_KEYS) or IMAGE_KEY),
+            divided=read_divided_light(entry, entry.is_projection),
         )
 
 
-def _entry(file: h5py.File, path: Path, wanted: str | None) -> h5py.Group:
-    """The group of the scan: the one that is `wanted`, or /entry, or the file's default or only one with frames."""
-    found = _scans_in(file)
+def _scan_group(file: h5py.File, path: Path, wanted: str | None) -> h5py.Group:
+    """The group of the scan: the one that is `wanted`, or /entry, or the file's default or only one with frames, at the
+    top of the file or one below, as Diamond has them."""
+
+    def holds_frames(item: Any) -> bool:
+        return isinstance(item, h5py.Group) and any(isinstance(item.get(n), h5py.Dataset) for n in DATA_NAMES)
+
+    found = list[str]()
+    for name, group in file.items():
+        if holds_frames(group):
+            found.append(name)
+        elif isinstance(group, h5py.Group):
+            found += [f"{name}/{inner}" for inner, item in group.items() if holds_frames(item)]
     if wanted is not None:
         group = file.get(wanted)
         if not isinstance(group, h5py.Group):
@@ -117,21 +131,6 @@ def _entry(file: h5py.File, path: Path, wanted: str | None) -> h5py.Group:
         f"{path} must hold the group /entry (NeXus NXtomo), but it holds {', '.join(file) or 'nothing'}; frames are "
         f"looked for as {' or '.join(DATA_NAMES)} in a group, or a group in that."
     )
-
-
-def _scans_in(file: h5py.File) -> list[str]:
-    """The groups that hold frames: at the top of the file, or one below, as Diamond has them."""
-    found = []
-    for name, group in file.items():
-        if not isinstance(group, h5py.Group):
-            continue
-        inner = [f"{name}/{n}" for n, item in group.items() if isinstance(item, h5py.Group) and _holds_frames(item)]
-        found += [name] if _holds_frames(group) else inner
-    return found
-
-
-def _holds_frames(group: h5py.Group) -> bool:
-    return any(isinstance(group.get(name), h5py.Dataset) for name in DATA_NAMES)
 
 
 def _frame_kinds(fields: Fields) -> np.ndarray:
@@ -157,209 +156,143 @@ def _frame_kinds(fields: Fields) -> np.ndarray:
     return kinds.astype(int)
 
 
-def _say_unequal_times(fields: Fields, kinds: np.ndarray) -> None:
+def _say_unequal_times(entry: Entry) -> None:
     """A warning where flats or darks were exposed longer or shorter than the projections, by a `count_time` of each
     frame: flats divide by another amount of light, and dark current grows with time."""
-    name = fields.find(*COUNT_TIMES)
-    if name is None or (times := fields.numbers(name)).shape != kinds.shape:
+    name = entry.find(*COUNT_TIMES)
+    if name is None or (times := entry.numbers(name)).shape != entry.kinds.shape:
         return
-    usual = float(np.median(times[kinds == PROJECTION]))
+    usual = float(np.median(times[entry.is_projection]))
     for kind, called in ((FLAT, "flats"), (DARK, "darks")):
-        others = times[kinds == kind]
+        others = times[entry.kinds == kind]
         if len(others) and not np.isclose(np.median(others), usual, rtol=SAME_TIME):
             warn(
-                f"{fields.label(name)}: {called} were exposed {np.median(others):.4g} s, but projections {usual:.4g} "
+                f"{entry.label(name)}: {called} were exposed {np.median(others):.4g} s, but projections {usual:.4g} "
                 "s; take frames of the same time, by --flats and --darks, unless the counts were scaled"
             )
 
 
-def _require_no_two_missing(fields: Fields, given: Mapping[str, Any]) -> None:
+def _require_no_two_missing(entry: Entry) -> None:
     """`InputError` that names all options at once, where a file says little; one missing dataset is named by itself."""
     names = {
         "energy_kev": (*ENERGIES, *WAVELENGTHS),
         "distance": DISTANCES,
         "pixel_size": [n.format(x) for n in PIXEL_SIZES for x in "xy"],
     }
-    missing = [name for name, paths in names.items() if given.get(name) is None and not fields.find(*paths)]
+    missing = [name for name, paths in names.items() if entry.given.get(name) is None and not entry.find(*paths)]
     if len(missing) > 1:
-        require_said(str(fields.path), missing)
+        require_said(str(entry.path), missing)
 
 
-def _marked(fields: Fields, shape: tuple[int, int]) -> np.ndarray | None:
-    """`pixel_mask` [H, W] of NXdetector as stored, if there is one."""
-    name = fields.find(*MASKS)
-    return shaped(fields.label(name), fields.numbers(name), shape) if name else None
+def _views(entry: Entry) -> Views:
+    """The views, with the rays of a cone where the file or the distance of the source says so."""
+    shifts = entry.optional(SHIFT, LENGTH_UNITS, "m", (2,))
+    larger = _magnification(entry, "pixel_size", PIXEL_SIZES[:2])
+    pixel_size = (said(entry.given, "pixel_size") or _pixel_sizes(entry)) / larger
+    entry.tell_moves(float(np.min(pixel_size)))
+    if entry.given.get("angles_deg") is not None or not entry.find(ROTATION):
+        views = Views.of_pixels(_rotations_of_angles(entry), shifts, entry.shape, pixel_size)
+        views = views if entry.find(SHIFT) else entry.about_axis(views)
+    else:
+        rotations = entry.per_frame(ROTATION, {}, "", (3, 3))
+        try:
+            views = Views.of_pixels(rotations, shifts, entry.shape, pixel_size)
+        except InputError as error:
+            raise InputError(f"{entry.label(ROTATION)}: {error}") from None
+    if entry.find(CONE) and entry.given.get("source_distance") is None:
+        return replace(views, sources=entry.per_frame(CONE, LENGTH_UNITS, "m"))
+    return with_rays(views, entry.source()[1])
 
 
-def _per_frame(fields: Fields, kinds: np.ndarray, name: str, tail: tuple[int, ...] = ()) -> np.ndarray:
-    """The dataset `name` for the projections, [n, *tail] float64, all finite; one value serves all."""
-    values = fields.numbers(name)
-    projections = np.flatnonzero(kinds == PROJECTION)
-    if tail == () and values.size == 1:
-        values = np.full(len(projections), values.reshape(-1)[0])
-    elif values.shape == (len(kinds), *tail):
-        values = values[projections]
-    elif values.shape != (len(projections), *tail):
-        one = "one value or " if tail == () else ""
-        shape = ", ".join(str(n) for n in (len(kinds), *tail))
-        raise InputError(
-            f"{fields.label(name)} must hold {one}an entry for each frame, [{shape}], but its shape is "
-            f"{list(values.shape)}."
-        )
-    return finite(fields.label(name), values)
-
-
-def _optional(
-    fields: Fields,
-    kinds: np.ndarray,
-    name: str,
-    table: dict[str, float],
-    unit: str,
-    tail: tuple[int, ...] = (),
-) -> np.ndarray:
-    """The dataset `name` for the projections in the base unit of `table`; zeros [n, *tail] if absent."""
-    if not fields.find(name):
-        return np.zeros((int((kinds == PROJECTION).sum()), *tail))
-    return _per_frame(fields, kinds, name, tail) * fields.unit(name, table, unit)
-
-
-def _views(fields: Fields, kinds: np.ndarray, given: Mapping[str, Any]) -> Views:
-    views = _placed(fields, kinds, given)
-    if fields.find(CONE) and given.get("source_distance") is None:
-        return replace(views, sources=_per_frame(fields, kinds, CONE) * fields.unit(CONE, LENGTH_UNITS, "m"))
-    return with_rays(views, source_before(fields, given)[1])
-
-
-def _placed(fields: Fields, kinds: np.ndarray, given: Mapping[str, Any]) -> Views:
-    """The views with parallel rays."""
-    shape = fields.dataset(fields.need(*DATA_NAMES)).shape[1:]
-    shifts = _optional(fields, kinds, SHIFT, LENGTH_UNITS, "m", (2,))
-    larger = _magnification(fields, kinds, given, "pixel_size", PIXEL_SIZES[:2])
-    pixel_size = (said(given, "pixel_size") or _pixel_sizes(fields, kinds)) / larger
-    tell_moves(fields, lambda name: _per_frame(fields, kinds, name), float(np.min(pixel_size)))
-    if given.get("angles_deg") is not None or not fields.find(ROTATION):
-        views = Views.of_pixels(_rotations_of_angles(fields, kinds, given), shifts, shape, pixel_size)
-        return views if fields.find(SHIFT) else about_axis(fields, views)
-    rotations = _per_frame(fields, kinds, ROTATION, (3, 3))
-    try:
-        return Views.of_pixels(rotations, shifts, shape, pixel_size)
-    except InputError as error:
-        raise InputError(f"{fields.label(ROTATION)}: {error}") from None
-
-
-def _rotations_of_angles(fields: Fields, kinds: np.ndarray, given: Mapping[str, Any]) -> np.ndarray:
-    if given.get("angles_deg") is not None:
-        return rotation_y(angles_of_projections(given["angles_deg"], kinds == PROJECTION))
-    unsaid = {"angles_deg": np.zeros(int((kinds == PROJECTION).sum()))}
-    name = fields.need(*ANGLES, way_out="say it by --angles FILE, or add it", stand_in=unsaid)
-    angles = _per_frame(fields, kinds, name)
-    if {"units", "unit"}.isdisjoint(fields.dataset(name).attrs):
+def _rotations_of_angles(entry: Entry) -> np.ndarray:
+    if entry.given.get("angles_deg") is not None:
+        return rotation_y(angles_of_projections(entry.given["angles_deg"], entry.is_projection))
+    unsaid = {"angles_deg": np.zeros(entry.count)}
+    name = entry.need(*ANGLES, way_out="say it by --angles FILE, or add it", stand_in=unsaid)
+    if {"units", "unit"}.isdisjoint(entry.dataset(name).attrs):
+        most = np.abs(entry.per_frame(name, {}, "")).max()
         require(
-            np.abs(angles).max() <= MOST_RADIANS,
-            f"{fields.label(name)} must carry @units, without which it is in radians, but it reaches "
-            f"{np.abs(angles).max():g}; set @units to 'deg' if these are degrees.",
+            most <= MOST_RADIANS,
+            f"{entry.label(name)} must carry @units, without which it is in radians, but it reaches {most:g}; set "
+            "@units to 'deg' if these are degrees.",
         )
-        if angles.any():
-            most = np.abs(angles).max()
-            warn(f"{fields.label(name)} has no @units: its angles, up to {most:.4g}, are taken as radians")
-    angles_deg = np.rad2deg(angles * fields.unit(name, ANGLE_UNITS, "rad"))
-    tell_steps(angles_deg, fields.label(name))
+        if most > 0:
+            warn(f"{entry.label(name)} has no @units: its angles, up to {most:.4g}, are taken as radians")
+    angles_deg = np.rad2deg(entry.per_frame(name, ANGLE_UNITS, "rad"))
+    tell_steps(angles_deg, entry.label(name))
     return rotation_y(angles_deg)
 
 
-def _pixel_sizes(fields: Fields, kinds: np.ndarray) -> float | np.ndarray:
+def _pixel_sizes(entry: Entry) -> float | np.ndarray:
     """The pixel size [m], or those [n] of the projections; x and y must share them, and y alone is not enough."""
     for names in ((name.format("x"), name.format("y")) for name in PIXEL_SIZES):
-        found = [name for name in names if fields.find(name)]
+        found = [name for name in names if entry.find(name)]
         if not found:
             continue
-        sizes = [_per_frame(fields, kinds, name) * fields.unit(name, LENGTH_UNITS, "m") for name in found]
+        sizes = [entry.per_frame(name, LENGTH_UNITS, "m") for name in found]
         for name, each in zip(found, sizes):
             for size in (each.min(), each.max()):
-                in_range(fields.label(name), float(size), *PIXEL_RANGE_M, unit="metres")
+                in_range(entry.label(name), float(size), *PIXEL_RANGE_M, unit="metres")
         across, down = sizes[0], sizes[-1]
         require(
             found[0] == names[0],
-            f"{fields.label(names[0])} must be there beside y_pixel_size ({down[0]:g} m), but it is missing; say the "
+            f"{entry.label(names[0])} must be there beside y_pixel_size ({down[0]:g} m), but it is missing; say the "
             "size of square pixels by --pixel-size, or add it.",
         )
         unequal = np.flatnonzero(~np.isclose(across, down, rtol=1e-6, atol=0))
         if len(unequal):
             raise InputError(
-                f"{fields.label(names[0])} and {names[1].rsplit('/', 1)[1]} must be equal (square pixels), but they "
+                f"{entry.label(names[0])} and {names[1].rsplit('/', 1)[1]} must be equal (square pixels), but they "
                 f"are {across[unequal[0]]:g} m and {down[unequal[0]]:g} m; resample the frames first."
             )
         return float(across[0]) if np.allclose(across, across[0], rtol=1e-6, atol=0) else across
-    missing = fields.label(PIXEL_SIZES[-1].format("x"))
-    said = f"{missing} must be there, but it is missing; say it by --pixel-size, or add it."
-    raise UnsaidError(said, stand_in("pixel_size"))
+    missing = entry.label(PIXEL_SIZES[-1].format("x"))
+    message = f"{missing} must be there, but it is missing; say it by --pixel-size, or add it."
+    raise UnsaidError(message, stand_in("pixel_size"))
 
 
-def _energies(fields: Fields, kinds: np.ndarray, given: Mapping[str, Any]) -> np.ndarray:
+def _energies(entry: Entry) -> np.ndarray:
     """Photon energies [n] of the projections in keV; energies that differ only by rounding become one."""
-    told = said(given, "energy_kev")
-    if told is not None:
-        return np.full(int((kinds == PROJECTION).sum()), told)
-    name = fields.find(*ENERGIES) or fields.find(*WAVELENGTHS)
-    name = name or fields.need(*ENERGIES, way_out="say it by --energy-kev, or add it", stand_in=stand_in("energy_kev"))
-    if name in WAVELENGTHS:
-        energies = PLANCK_TIMES_C_KEV_M / (_per_frame(fields, kinds, name) * fields.unit(name, LENGTH_UNITS, "m"))
-    else:
-        energies = _per_frame(fields, kinds, name) * fields.unit(name, ENERGY_UNITS, "keV")
+    if (told := said(entry.given, "energy_kev")) is not None:
+        return np.full(entry.count, told)
+    name = entry.find(*ENERGIES, *WAVELENGTHS)
+    name = name or entry.need(*ENERGIES, way_out="say it by --energy-kev, or add it", stand_in=stand_in("energy_kev"))
+    of_waves = name in WAVELENGTHS
+    values = entry.per_frame(name, *((LENGTH_UNITS, "m") if of_waves else (ENERGY_UNITS, "keV")))
+    energies = PLANCK_TIMES_C_KEV_M / values if of_waves else values
     for energy in (energies.min(), energies.max()):
-        in_range(
-            fields.label(name), float(energy), *(BEAM_RANGE_KEV if name in WAVELENGTHS else ENERGY_RANGE_KEV), "keV"
-        )
+        in_range(entry.label(name), float(energy), *(BEAM_RANGE_KEV if of_waves else ENERGY_RANGE_KEV), "keV")
     same = np.allclose(energies, energies[0], rtol=1e-6, atol=0)
     return np.full(len(energies), energies[0]) if same else energies
 
 
-def _distances(fields: Fields, kinds: np.ndarray, given: Mapping[str, Any]) -> np.ndarray:
-    told = said(given, "distance")
-    larger = _magnification(fields, kinds, given, "distance", DISTANCES[:1])
+def _distances(entry: Entry) -> np.ndarray:
+    """Effective propagation distances [n] of the projections [m]."""
+    told, larger = said(entry.given, "distance"), _magnification(entry, "distance", DISTANCES[:1])
     if told is not None:
-        return np.full(int((kinds == PROJECTION).sum()), told) / larger
-    distances = _distances_of_file(fields, kinds) / larger
+        return np.full(entry.count, told) / larger
+    name = entry.need(*DISTANCES, way_out="say it by --distance, or add it", stand_in=stand_in("distance"))
+    distances = entry.per_frame(name, LENGTH_UNITS, "m") / larger
     for distance in (distances.min(), distances.max()):
-        checked_distance(float(distance), fields.label(fields.find(*DISTANCES) or ""))
+        checked_distance(float(distance), entry.label(name))
     return distances
 
 
-def _distances_of_file(fields: Fields, kinds: np.ndarray) -> np.ndarray:
-    name = fields.need(*DISTANCES, way_out="say it by --distance, or add it", stand_in=stand_in("distance"))
-    return _per_frame(fields, kinds, name) * fields.unit(name, LENGTH_UNITS, "m")
-
-
-def _magnification(
-    fields: Fields, kinds: np.ndarray, given: Mapping[str, Any], quantity: str, effective: tuple[str, ...]
-) -> np.ndarray | float:
+def _magnification(entry: Entry, quantity: str, effective: tuple[str, ...]) -> np.ndarray | float:
     """(R + z) / R of a source R before the sample, by which pixels and distance are divided; 1 for a parallel beam, and
     where the file has one of the `effective` names, or the quantity is said without the source."""
-    told = said(given, quantity) is not None
-    if told and given.get("source_distance") is None:
+    told = said(entry.given, quantity) is not None
+    if told and entry.given.get("source_distance") is None:
         return 1.0
-    if not told and fields.find(*(name.format(axis) for name in effective for axis in "xy")):
+    if not told and entry.find(*(name.format(axis) for name in effective for axis in "xy")):
         return 1.0
-    return magnification(fields, lambda name: _per_frame(fields, kinds, name), DISTANCES[1], given)
+    return entry.magnification(DISTANCES[1])
 
 
-def _split(fields: Fields, kinds: np.ndarray) -> np.ndarray:
-    split = _optional(fields, kinds, SPLIT, PIXEL_UNITS, "")
-    wrong = split[~np.isin(split, (0, 1))]
-    require(len(wrong) == 0, f"{fields.label(SPLIT)} must hold 0 (train) or 1 (test), but it holds {wrong[:1]}.")
-    return split == 1
-
-
-def _read_provenance(fields: Fields) -> dict[str, str]:
-    group = fields.group.get(PROVENANCE)
-    if not isinstance(group, h5py.Group):
-        return {}
-    texts = {}
-    for name, item in group.items():
-        if isinstance(item, h5py.Dataset) and h5py.check_string_dtype(item.dtype) and item.shape == ():
-            texts[_unescaped(name)] = item.asstr(errors="replace")[()]
-    return texts
-
-
-def _unescaped(name: str) -> str:
-    return name.replace("%2E", ".").replace("%2F", "/").replace("%25", "%")
+def _read_provenance(entry: h5py.Group) -> dict[str, str]:
+    group = entry.get(PROVENANCE)
+    return {
+        unquote(name): str(item.asstr(errors="replace")[()])
+        for name, item in (group.items() if isinstance(group, h5py.Group) else ())
+        if isinstance(item, h5py.Dataset) and h5py.check_string_dtype(item.dtype) and item.shape == ()
+    }

@@ -59,8 +59,7 @@ def write_stl(path: Path, bodies: Sequence[TriangleMesh]) -> None:
 
 
 def write_glb(path: Path, bodies: Sequence[TriangleMesh], matter: Sequence[Matter], of: Contents = REFRACTION) -> None:
-    """Write still bodies as a GLB file, one node a body, with δ and β (or µ and β) of the `matter` of each in the
-    extras of its material."""
+    """Write still bodies as a GLB file, a node each; δ and β (or µ and β) of their `matter` are extras of materials."""
     require(len(bodies) > 0, "a GLB file needs at least one body.")
     file = _Glb([])
     for body, filling in zip(bodies, matter):
@@ -107,8 +106,7 @@ class _Glb:
         targets: np.ndarray | Sequence[np.ndarray] = (),
         weights: np.ndarray | Sequence[float] = (),
     ) -> None:
-        """A body of `vertices` [P, 3] [m] of matter with `constants`, with morph `targets` [K, P, 3] [m] and the
-        `weights` [K] it begins with."""
+        """Add a body: vertices [P, 3] [m], constants of its matter, morph targets [K, P, 3] [m], first weights [K]."""
         self.constants += [] if constants in self.constants else [constants]
         material = self.constants.index(constants)
         primitive: dict[str, Any] = {"attributes": {"POSITION": self._places(vertices)}, "material": material}
@@ -205,26 +203,20 @@ NAMES = (
 def write_splats(path: Path, cloud: GaussianCloud) -> None:
     """Write the Gaussians of `cloud` for splat viewers; `InputError` if there are none."""
     require(len(cloud) > 0, "a file of splats needs at least one Gaussian, but the object has none.")
-    with torch.no_grad():
-        rows = splats_of(cloud)
-    note = f"holosplat: um, optical depth {DEPTH:g} where the object is thickest along z"
-    write_vertices(path, rows, (note,))
-
-
-def splats_of(cloud: GaussianCloud) -> np.ndarray:
-    """The rows of the file, [N] with the fields `NAMES`: in µm; scales as logarithms, opacities as logits."""
     unit = MICROMETRES * cloud.unit_length
-    alpha = opacities(cloud)
-    columns = [
-        (unit * cloud.centres.double()).numpy(),
-        np.zeros((len(cloud), 3)),
-        (colours(cloud) - 0.5) / CONSTANT,
-        np.log(alpha / (1 - alpha))[:, None],
-        cloud.log_scales.double().numpy() + math.log(unit),
-        unit_quaternions(cloud.quaternions.double()).numpy(),
-    ]
+    with torch.no_grad():
+        alpha = opacities(cloud)
+        columns = [  # in µm; scales as logarithms, opacities as logits
+            (unit * cloud.centres.double()).numpy(),
+            np.zeros((len(cloud), 3)),
+            (colours(cloud) - 0.5) / CONSTANT,
+            np.log(alpha / (1 - alpha))[:, None],
+            cloud.log_scales.double().numpy() + math.log(unit),
+            unit_quaternions(cloud.quaternions.double()).numpy(),
+        ]
     values = np.concatenate(columns, axis=1).astype("<f4")
-    return values.view([(name, "<f4") for name in NAMES]).reshape(-1)
+    note = f"holosplat: um, optical depth {DEPTH:g} where the object is thickest along z"
+    write_vertices(path, values.view([(name, "<f4") for name in NAMES]).reshape(-1), (note,))
 
 
 def opacities(cloud: GaussianCloud, deepest: float = DEPTH) -> np.ndarray:

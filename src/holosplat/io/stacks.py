@@ -13,7 +13,7 @@ import numpy as np
 
 from ..checks import InputError, MissingError, note, require, require_regular
 from .guard import RATIO, SMALL, mapped_array, require_declared, require_inflated, require_memory, undamaged
-from .leftovers import is_hidden
+from .lock import is_hidden
 
 IMAGES = (".tif", ".tiff", ".png")
 
@@ -66,7 +66,12 @@ def stack_of(path: Path, pattern: str | None = None) -> ImageStack | np.ndarray:
     A folder's files are taken in the order of their names, with numbers in them counted as numbers.
     """
     if path.suffix.lower() == ".npy" and path.is_file():
-        return _array(path)
+        found = mapped_array(path, "a NumPy array")
+        require(
+            found.ndim in (2, 3) and found.dtype.kind in "iuf",
+            f"{path} must hold frames [N, H, W] of numbers, but it holds {found.dtype} of the shape {found.shape}.",
+        )
+        return found.reshape(-1, *found.shape[-2:])
     files = images_in(path, pattern) if path.is_dir() else [path]
     like = f" named {pattern}" if pattern else ""
     require(len(files) > 0, f"{path} must hold images ({', '.join(IMAGES)}), but it holds none{like}.")
@@ -87,21 +92,17 @@ def _is_image(file: Path) -> bool:
     return file.suffix.lower() in IMAGES and file.is_file() and not is_hidden(file)
 
 
-def _array(path: Path) -> np.ndarray:
-    found = mapped_array(path, "a NumPy array")
-    require(
-        found.ndim in (2, 3) and found.dtype.kind in "iuf",
-        f"{path} must hold frames [N, H, W] of numbers, but it holds {found.dtype} of the shape {found.shape}.",
-    )
-    return found.reshape(-1, *found.shape[-2:])
-
-
 def _pages(file: Path) -> list[int]:
     if file.suffix.lower() == ".png":
         return [0]
     with open_tiff(file) as opened:
         found = image_numbers(opened, file)  # first: the axes of OME leave pages that say less of themselves
-        require_one_channel(opened, file)
+        if opened.is_imagej or opened.is_ome:
+            axes = dict(zip(opened.series[0].axes, opened.series[0].shape))
+            several = axes.get("C", 1) > 1 and max(axes.get("T", 1), axes.get("Z", 1)) > 1
+            require(
+                not several, f"{file} must hold frames of one channel, but it has {axes.get('C')}; save one of them."
+            )
         return found
 
 
@@ -109,23 +110,18 @@ def _image(file: Path, page: int) -> np.ndarray:
     """One grey image [H, W]; of a coloured one whose colours are equal, one of them."""
     with undamaged(file, "a complete image"):
         if file.suffix.lower() == ".png":
-            image = _png(file)
+            from PIL import Image
+
+            with Image.open(file, formats=("PNG",)) as png:
+                image = np.asarray(png.convert("RGB") if png.mode == "P" else png)
         else:
             with open_tiff(file) as opened:
                 image = image_values(opened, file, page)
     if image.ndim == 3 and image.shape[2] in (3, 4) and (image[..., :3] == image[..., :1]).all():
         note(f"{file.parent}: images there have three equal colours, of which one is taken")
         image = image[..., 0]
-    grey = image.ndim == 2 and image.dtype.kind in "iuf"
-    require(grey, f"{file} must hold grey images of numbers, but one is {image.dtype} of the shape {image.shape}.")
+    _require_grey(image, file)
     return image
-
-
-def _png(file: Path) -> np.ndarray:
-    from PIL import Image
-
-    with Image.open(file, formats=("PNG",)) as opened:
-        return np.asarray(opened.convert("RGB") if opened.mode == "P" else opened)
 
 
 DEFLATE = (8, 32946)
@@ -159,10 +155,9 @@ def open_tiff(file: Path) -> Iterator[Any]:
 
 
 def image_numbers(opened: Any, file: Path) -> list[int]:
-    """The numbers of the images of an open TIFF file: its pages, without smaller copies of others, or, where there is
-    one page, the planes behind it (ImageJ writes large stacks so). Errors: `InputError` for pages that run in a circle
-    or beyond its end, and for fewer planes than ImageJ declares."""
-    places, whole, following = set[int](), list[int](), 0
+    """The numbers of an open TIFF file's images: whole pages, or planes behind the only page (as of ImageJ). Errors:
+    `InputError` for pages in a circle or beyond the end, and for missing planes."""
+    places, whole, following, tiff = set[int](), list[int](), 0, opened.tiff  # tifffile leaves pages beyond the end
     while True:
         try:
             page = opened.pages[len(places)]
@@ -171,30 +166,15 @@ def image_numbers(opened: Any, file: Path) -> list[int]:
         require(page.offset not in places, f"{file} must hold its pages one after another, but they run in a circle.")
         places.add(page.offset)
         whole += [] if page.is_reduced and whole else [len(places) - 1]
-        following = _next_page(opened, page)
+        opened.filehandle.seek(page.offset)
+        (tags,) = struct.unpack(tiff.tagnoformat, opened.filehandle.read(tiff.tagnosize))
+        opened.filehandle.seek(page.offset + tiff.tagnosize + tags * tiff.tagsize)
+        (following,) = struct.unpack(tiff.offsetformat, opened.filehandle.read(tiff.offsetsize))
     require(following == 0, f"{file} must hold its pages whole, but the one after {len(places)} is not; save it anew.")
     if len(whole) == 1:
         return list(range(_planes(opened, file)))
     samples = _samples(opened.pages[0])
     return [page * samples + sample for page in whole for sample in range(samples)]
-
-
-def require_one_channel(opened: Any, file: Path) -> None:
-    """`InputError` for a hyperstack of ImageJ or OME whose images are those of several channels."""
-    if opened.is_imagej or opened.is_ome:
-        axes = dict(zip(opened.series[0].axes, opened.series[0].shape))
-        several = axes.get("C", 1) > 1 and max(axes.get("T", 1), axes.get("Z", 1)) > 1
-        require(not several, f"{file} must hold frames of one channel, but it has {axes.get('C')}; save one of them.")
-
-
-def _next_page(opened: Any, page: Any) -> int:
-    """Where the page after `page` begins [bytes]; 0 for none. tifffile leaves pages beyond the end of a file."""
-    tiff, handle = opened.tiff, opened.filehandle
-    handle.seek(page.offset)
-    (tags,) = struct.unpack(tiff.tagnoformat, handle.read(tiff.tagnosize))
-    handle.seek(page.offset + tiff.tagnosize + tags * tiff.tagsize)
-    (found,) = struct.unpack(tiff.offsetformat, handle.read(tiff.offsetsize))
-    return int(found)
 
 
 def _samples(page: Any) -> int:
@@ -228,36 +208,43 @@ def image_values(opened: Any, file: Path, number: int) -> np.ndarray:
 
     It is turned upright as its orientation says, and white that is stored as 0 becomes the greatest number.
     """
-    samples = _samples(opened.pages[0])
+    samples, is_plane = _samples(opened.pages[0]), False
     try:
-        page, plane = opened.pages[number // samples], None
+        page = opened.pages[number // samples]
     except IndexError:
-        page, plane = opened.pages[0], number
+        page, is_plane = opened.pages[0], True
     label = f"{file}: an image of {'x'.join(map(str, page.shape))}"
     declared = int(np.prod(page.shape, dtype=object)) * np.dtype(page.dtype or "u1").itemsize
     require_memory(label, declared)
     require_declared(label, declared, file.stat().st_size)
-    if int(page.compression) in DEFLATE:
-        _require_segments(page, label, declared)
-    values = page.asarray() if plane is None else _plane(opened, plane, file)
+    most = max(SMALL, 2 * declared)  # tiles have margins
+    for offset, size in zip(page.dataoffsets, page.databytecounts) if int(page.compression) in DEFLATE else ():
+        if size * RATIO > most:
+            opened.filehandle.seek(offset)
+            require_inflated(label, opened.filehandle.read(size), most)
+    if is_plane:  # one of those behind the only page
+        opened.filehandle.seek(opened.series[0].dataoffset + number * declared)
+        content = opened.filehandle.read(declared)
+        whole = len(content) == declared
+        require(whole, f"{file} must hold {number + 1} images, but it is cut short; save it anew.")
+        values = np.frombuffer(content, np.dtype(page.dtype).newbyteorder(opened.byteorder)).reshape(page.shape)
+    else:
+        values = page.asarray()
     return _upright(page, _grey(page, values[number % samples] if samples > 1 else values, file), file)
 
 
-def _plane(opened: Any, number: int, file: Path) -> np.ndarray:
-    """Plane `number` behind the one page of an open TIFF file."""
-    page = opened.pages[0]
-    dtype = np.dtype(page.dtype).newbyteorder(opened.byteorder)
-    size = int(np.prod(page.shape)) * dtype.itemsize
-    opened.filehandle.seek(opened.series[0].dataoffset + number * size)
-    content = opened.filehandle.read(size)
-    require(len(content) == size, f"{file} must hold {number + 1} images, but it is cut short; save it anew.")
-    return np.frombuffer(content, dtype).reshape(page.shape)
-
-
 def all_images(file: Path) -> list[np.ndarray]:
-    """The values of all images of a TIFF file. Errors: `InputError` for one that is damaged or none."""
+    """The grey values of all images of a TIFF file. Errors: `InputError` for one that is damaged or none."""
     with open_tiff(file) as opened:
-        return [image_values(opened, file, number) for number in image_numbers(opened, file)]
+        images = [image_values(opened, file, number) for number in image_numbers(opened, file)]
+    for image in images:
+        _require_grey(image, file)
+    return images
+
+
+def _require_grey(image: np.ndarray, file: Path) -> None:
+    grey = image.ndim == 2 and image.dtype.kind in "iuf"
+    require(grey, f"{file} must hold grey images of numbers, but one is {image.dtype} of the shape {image.shape}.")
 
 
 def _grey(page: Any, values: np.ndarray, file: Path) -> np.ndarray:
@@ -292,12 +279,3 @@ def _upright(page: Any, values: np.ndarray, file: Path) -> np.ndarray:
     if kind > 4:  # rows are columns
         values, kind = values.swapaxes(0, 1), {5: 1, 6: 2, 7: 3, 8: 4}[kind]
     return values[:: -1 if kind in (3, 4) else 1, :: -1 if kind in (2, 3) else 1]
-
-
-def _require_segments(page: Any, label: str, declared: int) -> None:
-    """Strips and tiles of a page unpack to no more than the page declares (tiles have margins: twice that)."""
-    handle = page.parent.filehandle
-    for offset, size in zip(page.dataoffsets, page.databytecounts):
-        if size * RATIO > max(SMALL, 2 * declared):
-            handle.seek(offset)
-            require_inflated(label, handle.read(size), max(SMALL, 2 * declared))

@@ -1,5 +1,4 @@
-"""Projections of raw files, flat-field corrected and mended when they are read; flats and darks in files of their own
-(--flats, --darks), and frames that have no data; which frames of a file count."""
+"""Projections of raw files, corrected and mended when they are read; flats and darks beside; frames without data."""
 
 from __future__ import annotations
 
@@ -16,27 +15,27 @@ import numpy as np
 from h5py import h5p, h5s  # pyright: ignore[reportAttributeAccessIssue]  # compiled, without stubs
 
 from ..checks import InputError, note, require
-from ..frames import Derived, Frames, Taken
+from ..frames import Derived, Taken
 from ..preprocess.pixels import FILLED, MOST_DEFECTS, filled, lit, relative_intensity
 from ..scan import Scan
 from .guard import read_archive
 from .hdf5 import open_hdf5
 from .hdf5_guard import chunks_of, opened_for_reading, virtual_places
+from .larger_frames import Rearranged
 from .odd_light import Beside, without_odd
-from .raw_file import DARK, FLAT, INVALID, PROJECTION, Opens, ScanFile, Stack, rows_of, together
+from .raw_file import DARK, FLAT, INVALID, PROJECTION, RAW_TAKES, Loader, Opens, ScanFile, together
 from .reading import marked
 from .stacks import ImageStack, stack_of
 
 KEYS = ("image_key_control", "image_key")
 FRAMES = re.compile("data|counts|frames|image", re.IGNORECASE)
+NAMED = {FLAT: "flat|white", DARK: "dark"}
+"""Names of the datasets of flats and of darks."""
 
 
 @dataclass(frozen=True)
 class DatasetStack:
-    """Frames [n, H, W] of a dataset in an HDF5 file, which is opened anew for each.
-
-    numbers: those of its frames that are taken.
-    """
+    """Frames [n, H, W] of a dataset in an HDF5 file, those of `numbers`; the file is opened anew for each."""
 
     path: Path
     dataset: str
@@ -59,38 +58,29 @@ def light_frames(path: Path, names: str, key: int) -> ImageStack | DatasetStack 
     """
     if path.is_file() and h5py.is_hdf5(path):
         with open_hdf5(path) as file:
-            return _dataset_stack(path, file, names, key)
+            found: dict[str, h5py.Dataset] = {}
+
+            def take(name: str, item: Any) -> None:
+                is_array = isinstance(item, h5py.Dataset) and item.ndim in (2, 3) and item.dtype.kind in "iuf"
+                if is_array and min(item.shape) > 0:
+                    found[name] = item
+
+            file.visititems(take)  # each dataset once, whatever links lead to it
+            dataset = found[name := _chosen(path, found, names)]
+            count = len(dataset) if dataset.ndim == 3 else 1
+            numbers, beside = np.arange(count), cast(h5py.Group, dataset.parent)
+            keys = next((beside[k] for k in KEYS if k in beside), None)
+            if isinstance(keys, h5py.Dataset) and keys.shape == (count,):
+                marks = np.asarray(keys)
+                numbers = next((n for mark in (key, 0) if len(n := np.flatnonzero(marks == mark))), numbers)
+            require_filled(dataset, f"{path}: /{name}", np.isin(np.arange(count), numbers))
+            return DatasetStack(path, name, tuple(numbers.tolist()), (len(numbers), *dataset.shape[-2:]))
     if path.suffix.lower() == ".npz" and path.is_file():
-        return _of_archive(path, names)
+        arrays = read_archive(path).items()
+        frames = {name: array for name, array in arrays if array.ndim in (2, 3) and array.dtype.kind in "iuf"}
+        array = frames[_chosen(path, frames, names)]
+        return array.reshape(-1, *array.shape[-2:])
     return stack_of(path)
-
-
-def _dataset_stack(path: Path, file: h5py.File, names: str, key: int) -> DatasetStack:
-    found: dict[str, h5py.Dataset] = {}
-
-    def take(name: str, item: Any) -> None:
-        if isinstance(item, h5py.Dataset) and item.ndim in (2, 3) and item.dtype.kind in "iuf" and min(item.shape) > 0:
-            found[name] = item
-
-    file.visititems(take)  # each dataset once, whatever links lead to it
-    name = _chosen(path, found, names)
-    dataset = found[name]
-    shape = (len(dataset) if dataset.ndim == 3 else 1, *dataset.shape[-2:])
-    numbers = np.arange(shape[0])
-    beside = cast(h5py.Group, dataset.parent)
-    keys = next((beside[k] for k in KEYS if k in beside), None)
-    if isinstance(keys, h5py.Dataset) and keys.shape == (shape[0],):
-        marks = np.asarray(keys)
-        numbers = next((n for mark in (key, 0) if len(n := np.flatnonzero(marks == mark))), numbers)
-    require_filled(dataset, f"{path}: /{name}", np.isin(np.arange(shape[0]), numbers))
-    return DatasetStack(path, name, tuple(numbers.tolist()), (len(numbers), shape[1], shape[2]))
-
-
-def _of_archive(path: Path, names: str) -> np.ndarray:
-    found = read_archive(path)
-    frames = {name: array for name, array in found.items() if array.ndim in (2, 3) and array.dtype.kind in "iuf"}
-    array = frames[_chosen(path, frames, names)]
-    return array.reshape(-1, *array.shape[-2:])
 
 
 def _chosen(path: Path, found: Mapping[str, Any], names: str) -> str:
@@ -205,40 +195,28 @@ class _Place:
     file: Path
     name: str
 
-    @classmethod
-    def of(cls, dataset: h5py.Dataset) -> _Place:
-        path = Path(dataset.file.filename).resolve()
-        return cls(path, str(dataset.name))
-
 
 @dataclass(frozen=True)
 class StoredFrames(Derived):
     """The projections of a file, flat-field corrected when they are read.
 
-    stacks: of the file; a dataset of HDF5 by its place.
-    numbers: [N] of the projections among the file's frames.
+    file: closed, with datasets of HDF5 by their places; numbers: [N] of the projections among its frames.
     dark, light: [H, W] mean dark field and mean flat field less that, light None where the file is corrected already.
     mask: [H, W] bool of the pixels that are marked as defective. These, and values that are not finite, are missing:
     they are filled from their neighbours, and their number is said.
-    held: the file that holds each projection, and its stamp when it was opened; are_counts: as of `rows_of`;
-    is_still: whether they are of one time, so that all show the same matter.
+    held: the file that holds each projection, and its stamp when it was opened.
 
     The file is opened anew for each reading. Errors: `InputError` for a file that is gone or changed, or of which more
     than a part `MOST_DEFECTS` of a frame is to be filled.
     """
 
-    path: Path
-    label: str
-    stacks: tuple[Stack | _Place, ...]
-    flips: tuple[bool, bool]
+    file: ScanFile
     numbers: np.ndarray
     dark: np.ndarray
     light: np.ndarray | None
     mask: np.ndarray
     shape: tuple[int, int, int]
     held: tuple[tuple[Path, tuple[int, ...]], ...]
-    are_counts: bool = True
-    is_still: bool = True
 
     @classmethod
     def of(cls, file: ScanFile) -> StoredFrames:
@@ -250,17 +228,26 @@ class StoredFrames(Derived):
             f"{file.label}: its pixel_mask marks {mask.mean():.0%} of the pixels as defective; 0 must stand for good "
             "ones.",
         )
-        dark, light = _fields_of_light(file)
+        has_flats = len(file.numbers(FLAT)) > 0
+        require(
+            has_flats or len(file.numbers(DARK)) == 0,
+            f"{file.kinds_label} must mark flats (1) beside the dark ones (2), but it marks none.",
+        )
+        dark, light = file.mean(DARK), None
         if mask.any():
             note(f"{file.label}: the {int(mask.sum())} pixels that the file marks as defective {FILLED}")
-        if light is not None:
-            light, mask = lit(file.label, light, mask)
-        stacks = tuple(_Place.of(stack) if isinstance(stack, h5py.Dataset) else stack for stack in file.stacks)
-        whole = (len(numbers), *file.exposures.views.shape)
-        places = [place for stack in file.stacks for place in _places_of(stack, path)]
+        if has_flats:
+            light, mask = lit(file.label, file.mean(FLAT) - dark, mask)
+        stacks, places = list[Any](), list[Path]()
+        for stack in file.stacks:
+            if isinstance(stack, h5py.Dataset):
+                stacks.append(_Place(Path(stack.file.filename).resolve(), str(stack.name)))
+            else:
+                stacks.append(stack)
+            places += [place for place, _ in stack.pages] if isinstance(stack, ImageStack) else [path] * stack.shape[0]
         held = tuple((places[n], _stamp(places[n])) for n in numbers)
-        told = (file.are_counts, len(np.unique(file.exposures.time)) == 1)
-        return cls(path, file.label, stacks, file.flips, numbers, dark, light, mask, whole, held, *told)
+        closed = replace(file, stacks=tuple(stacks), texts={}, divided=None)
+        return cls(closed, numbers, dark, light, mask, (len(numbers), *file.exposures.views.shape), held)
 
     def with_missing(self, numbers: np.ndarray) -> Taken:
         """See `Frames.with_missing`."""
@@ -270,61 +257,54 @@ class StoredFrames(Derived):
             changed = f"{place} must be the file that was opened, but it has changed since; open it again."
             require(_stamp(place) == stamp, changed)
         frames = np.empty((len(numbers), *self.shape[1:]), dtype=np.float32)
-        files = {stack.file for stack in self.stacks if isinstance(stack, _Place)}
+        stacks: list[Any] = list(self.file.stacks)
         with ExitStack() as opened:
+            files = {stack.file for stack in stacks if isinstance(stack, _Place)}
             file = {path: opened.enter_context(open_hdf5(path)) for path in files}
-            stacks: list[Any] = [
-                file[stack.file][stack.name] if isinstance(stack, _Place) else stack for stack in self.stacks
-            ]
+            stacks = [file[stack.file][stack.name] if isinstance(stack, _Place) else stack for stack in stacks]
+            again = replace(self.file, stacks=tuple(stacks))
             for i, n in enumerate(self.numbers[numbers]):  # one by one: raw frames are wider, and there may be many
-                raw = rows_of(stacks, int(n), slice(0, self.shape[1]), self.flips, self.are_counts)
+                raw = again.frame(n)
                 frames[i] = raw if self.light is None else relative_intensity(raw, self.dark, self.light)
-        found = filled(self.label, frames, ~np.isfinite(frames) & ~self.mask, self.mask, self.numbers[numbers])
+        label = self.file.label
+        found = filled(label, frames, ~np.isfinite(frames) & ~self.mask, self.mask, self.numbers[numbers])
         if 0 in numbers:  # once, where all pass by in turn
-            beside = Beside(self.label, self.is_still, self.light)
+            is_still = len(np.unique(self.file.exposures.time)) == 1  # so that all show the same matter
+            beside = Beside(label, is_still, self.light)
             for number, frame in zip(self.numbers[numbers], frames):
                 beside.add(int(number), frame)
             beside.tell()
         return found
 
 
-def _places_of(stack: Stack, path: Path) -> list[Path]:
-    """The file that holds each frame of a stack of the file or folder `path`."""
-    if isinstance(stack, ImageStack):
-        return [place for place, _ in stack.pages]
-    return [path] * stack.shape[0]
-
-
-class Mended(Derived):
-    """Frames whose pixels that are not above 0, which no light can be, are missing, too."""
-
-    def __init__(self, frames: np.ndarray | Frames, missing: np.ndarray | None = None) -> None:
-        self._frames, self._missing = frames, missing
-        self.shape = (frames.shape[0], frames.shape[1], frames.shape[2])
+class Mended(Rearranged):
+    """The frames of a scan whose pixels that are not above 0, which no light can be, are missing, too."""
 
     def with_missing(self, numbers: np.ndarray) -> Taken:
         """See `Frames.with_missing`."""
-        if isinstance(self._frames, Frames):
-            frames, before = self._frames.with_missing(numbers)
-        else:
-            frames, before = np.array(self._frames[numbers]), None if self._missing is None else self._missing[numbers]
+        frames, before = self.taken(numbers)
         before = np.zeros(frames.shape, dtype=bool) if before is None else before
         return filled("the scan", frames, (frames <= 0) & ~before, before, np.arange(self.shape[0])[numbers])
 
 
-def reader(opens: Opens) -> Callable[[Path, Mapping[str, Any]], Scan]:
-    """What reads the projections of a file that `opens` opens, flat-field corrected, and how they were taken.
-
-    Frames marked flat and dark correct the others: (frame - mean dark) / (mean flat - mean dark); frames marked
-    invalid are dropped. The projections are read when they are asked for (`StoredFrames`).
-    """
+def raw_loader(
+    name: str,
+    mark: str,
+    recognises: Callable[[Path], bool],
+    opens: Opens,
+    takes: tuple[str, ...] = RAW_TAKES,
+    *,
+    is_general: bool = False,
+) -> Loader:
+    """The loader of a format that `opens` opens, which reads the projections, (frame - mean dark) / (mean flat - mean
+    dark), when they are asked for (`StoredFrames`); frames marked invalid are dropped."""
 
     def read(path: Path, given: Mapping[str, Any]) -> Scan:
         with opens(path, given) as opened:
             file = with_fields(opened, given)
             return Scan.of(StoredFrames.of(file), file.exposures, file.is_test, file.provenance(), file.divided)
 
-    return read
+    return Loader(name, mark, recognises, read, takes, opens, is_general)
 
 
 def _stamp(path: Path) -> tuple[int, ...]:
@@ -333,22 +313,22 @@ def _stamp(path: Path) -> tuple[int, ...]:
     return found.st_mtime_ns, found.st_size, found.st_ino
 
 
-def _fields_of_light(file: ScanFile) -> tuple[np.ndarray, np.ndarray | None]:
-    """The mean dark field [H, W], and the mean flat field less that, None where the file has no flats."""
-    flats, darks = file.numbers(FLAT), file.numbers(DARK)
-    if len(darks) and not len(flats):
-        raise InputError(f"{file.kinds_label} must mark flats (1) beside the dark ones (2), but it marks none.")
-    dark = file.mean(DARK)
-    return dark, file.mean(FLAT) - dark if len(flats) else None
-
-
 def with_fields(file: ScanFile, given: Mapping[str, Any]) -> ScanFile:
-    """The file with the flats and darks that are `given` beside it (paths), after its own, and without frames to leave
-    out: those that are `given` by number, or flats and darks that are unlike the others of their kind.
-
-    Errors: `InputError` for frames without data.
-    """
-    file = _without(_with_given(file, given), given.get("leave_out"))
+    """The file with the flats and darks that are `given` beside it (paths), and without frames that are to be left out,
+    or flats and darks unlike the others. Errors: `InputError` for frames without data."""
+    extra = {kind: given[name] for kind, name in ((FLAT, "flats"), (DARK, "darks")) if given.get(name) is not None}
+    if extra and not file.has_given_fields:
+        parts = [(kind, light_frames(path, NAMED[kind], kind)) for kind, path in extra.items()]
+        stacks, kinds = together(str(file.path), [(PROJECTION, file.stacks[0]), *parts])
+        more = kinds[file.stacks[0].shape[0] :]
+        file = replace(file, stacks=(*file.stacks, *stacks[1:]), kinds=np.concatenate([file.kinds, more]))
+    if given.get("leave_out") is not None:
+        left = marked("--leave-out", given["leave_out"], len(file.kinds))
+        kept = ~left[file.numbers(PROJECTION)]
+        require(bool(kept.any()), "--leave-out must leave some projections, but it names them all.")
+        divided = None if file.divided is None else file.divided[np.flatnonzero(kept)]
+        kinds, exposures = np.where(left, INVALID, file.kinds), file.exposures[np.flatnonzero(kept)]
+        file = replace(file, kinds=kinds, exposures=exposures, is_test=file.is_test[kept], divided=divided)
     begin = 0
     for stack in file.stacks:
         if isinstance(stack, h5py.Dataset):
@@ -357,26 +337,3 @@ def with_fields(file: ScanFile, given: Mapping[str, Any]) -> ScanFile:
                 file = replace(file, marked=gaps if file.marked is None else gaps | (file.marked != 0))
         begin += stack.shape[0]
     return without_odd(file, is_told=given.get("leave_out") is not None)
-
-
-def _with_given(file: ScanFile, given: Mapping[str, Any]) -> ScanFile:
-    extra = [(kind, given.get(name)) for kind, name in ((FLAT, "flats"), (DARK, "darks"))]
-    if file.has_given_fields or all(path is None for _, path in extra):
-        return file
-    names = {FLAT: "flat|white", DARK: "dark"}
-    parts = [(kind, light_frames(path, names[kind], kind)) for kind, path in extra if path is not None]
-    stacks, kinds = together(str(file.path), [(PROJECTION, file.stacks[0]), *parts])
-    more = kinds[file.stacks[0].shape[0] :]
-    return replace(file, stacks=(*file.stacks, *stacks[1:]), kinds=np.concatenate([file.kinds, more]))
-
-
-def _without(file: ScanFile, numbers: str | None) -> ScanFile:
-    """The file without the frames that --leave-out names."""
-    if numbers is None:
-        return file
-    left = marked("--leave-out", numbers, len(file.kinds))
-    kept = ~left[file.numbers(PROJECTION)]
-    require(bool(kept.any()), "--leave-out must leave some projections, but it names them all.")
-    divided = None if file.divided is None else file.divided[np.flatnonzero(kept)]
-    kinds, exposures = np.where(left, INVALID, file.kinds), file.exposures[np.flatnonzero(kept)]
-    return replace(file, kinds=kinds, exposures=exposures, is_test=file.is_test[kept], divided=divided)

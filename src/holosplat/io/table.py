@@ -58,10 +58,6 @@ class Table:
             raise InputError(f"{self.label(name)} must hold numbers, but it is {shown(value)}.")
         return finite(self.label(name), shaped(self.label(name), array.astype(np.float64), shape))
 
-    def count(self, name: str) -> int:
-        """A whole number, not negative."""
-        return self.counts(name, ())[0]
-
     def counts(self, name: str, shape: tuple[int, ...]) -> tuple[int, ...]:
         """Whole numbers, none of them negative."""
         numbers = self.numbers(name, shape).reshape(-1)
@@ -117,8 +113,7 @@ class Table:
 
 
 def beam_table(scan: Scan) -> dict[str, Any]:
-    """The values that all frames share: the texts of `provenance`, and `pixel_size_m` and `energy_kev` if they are the
-    same."""
+    """The values that all frames share: `provenance`, and `pixel_size_m` and `energy_kev` if they are the same."""
     views, exposures = scan.views, scan.exposures
     energy = {"energy_kev": float(exposures.energy_kev[0])} if exposures.has_one_energy else {}
     pixel = {"pixel_size_m": views.pixel_size} if views.has_one_pixel else {}
@@ -126,11 +121,8 @@ def beam_table(scan: Scan) -> dict[str, Any]:
 
 
 def exposure_table(exposures: Exposures, n: int) -> dict[str, Any]:
-    """Frame `n`: `rotation` [3, 3], `shift_m` [2], `distance_m`, `psf_sigma_px`, `time_s`; floats are kept exactly.
-
-    `energy_kev` and `pixel_size_m` too, where frames have several, `bandwidth`, where any has one, and `source_m`, of
-    cones of rays.
-    """
+    """Frame `n`: `rotation` [3, 3], `shift_m` [2], `distance_m`, `psf_sigma_px`, `time_s`, exactly; `energy_kev` and
+    `pixel_size_m` where frames have several, `bandwidth` where any has one, and `source_m` of cones of rays."""
     views = exposures.views
     energy = {} if exposures.has_one_energy else {"energy_kev": float(exposures.energy_kev[n])}
     pixel = {} if views.has_one_pixel else {"pixel_size_m": float(views.pixel_sizes[n])}
@@ -156,7 +148,12 @@ def read_exposures(beam: Table, frames: Sequence[Table], shape: tuple[int, int])
     """
     values = [[_per_frame(beam, f, name, default) for f in frames] for name, default in _NUMBERS]
     shifts = [f.numbers("shift_m", (2,)) if "shift_m" in f else np.zeros(2) for f in frames]
-    rotations = [_rotation(f) for f in frames]
+    rotations = [
+        rotation_y([f.number("angle_deg")])[0]
+        if "angle_deg" in f and "rotation" not in f
+        else f.numbers("rotation", (3, 3))
+        for f in frames
+    ]
     pixel_sizes = np.array([_per_frame(beam, f, "pixel_size_m", None) for f in frames])
     try:
         views = Views.of_pixels(np.array(rotations), np.array(shifts), shape, pixel_sizes)
@@ -168,14 +165,15 @@ def read_exposures(beam: Table, frames: Sequence[Table], shape: tuple[int, int])
         raise InputError(f"{beam.path}: {error}") from None
 
 
-def in_order(head: Table, entries: Sequence[Table]) -> np.ndarray:
-    """[N] int: the entry of each frame of the scan, by their `index`: 0 … `count` - 1, each once."""
-    found = np.array([entry.number("index") for entry in entries])
-    count = head.count("count")
+def read_own_exposures(head: Table, frames: Sequence[Table], shape: tuple[int, int]) -> tuple[np.ndarray, Exposures]:
+    """The number [N] of each frame of the scan among `frames` of our own, by their `index`, and the exposures."""
+    entries = [frame.table("holosplat") for frame in frames]
+    found, count = np.array([entry.number("index") for entry in entries]), head.counts("count", ())[0]
     good = np.array_equal(np.sort(found), np.arange(count))
     where = entries[0].label("index")
     require(good, f"{where} and the others must be 0 to {count - 1}, each once, but they are {found.tolist()}.")
-    return np.argsort(found)
+    order = np.argsort(found)
+    return order, read_exposures(head, [entries[k] for k in order], shape)
 
 
 _NUMBERS = (("energy_kev", None), ("distance_m", None), ("psf_sigma_px", 0.0), ("time_s", 0.0), ("bandwidth", 0.0))
@@ -188,9 +186,3 @@ def _per_frame(beam: Table, frame: Table, name: str, default: float | None) -> f
     if name in beam:
         return beam.number(name)
     return frame.number(name) if default is None else default
-
-
-def _rotation(frame: Table) -> np.ndarray:
-    if "angle_deg" in frame and "rotation" not in frame:
-        return rotation_y([frame.number("angle_deg")])[0]
-    return frame.numbers("rotation", (3, 3))

@@ -78,8 +78,7 @@ class Stored:
     of: Contents = REFRACTION
 
     def volume(self, path: str | Path, delta_told: bool = True) -> Volume:
-        """The same as δ and β, or, without delta_told, β and β. `InputError` that names the file where its numbers are
-        µ in place of δ."""
+        """The volume; without delta_told β stands for δ. `InputError` with the path where µ stands in place of δ."""
         if not delta_told:
             return Volume(self.arrays[1], self.arrays[1], self.grid)
         require(
@@ -159,11 +158,8 @@ def write_slabs(
     of: Contents = REFRACTION,
     beside: Beside = ALONE,
 ) -> None:
-    """Write the volume on `grid` from its parts `slabs`, each with the y index of its first slice.
-
-    Attributes say units and axes, too. The parts must cover the grid; `path` is replaced only once all are written.
-    beside: what more the file holds of each voxel.
-    """
+    """Write the volume on `grid` from `slabs` that cover it, each with the y index of its first slice, and what is
+    `beside` it of each voxel; `path` is replaced only once all are written."""
     attributes = {"voxel_size": np.array(grid.voxel_size), "origin": np.array(grid.origin), **SAID}
     with new_hdf5(path, 4 * (len(NAMES) + len(beside)) * math.prod(grid.shape)) as file:
         file.attrs.update(attributes)
@@ -189,11 +185,7 @@ def write_voxels(
     of: Contents = REFRACTION,
     beside: Beside = ALONE,
 ) -> None:
-    """Write `obj` voxelised on `grid`, slab by slab; at most `SLAB_VOXELS` voxels are in memory, however large the
-    grid.
-
-    `on_progress(fraction)` is called after each slab. beside: as of `write_slabs`.
-    """
+    """Write `obj` on `grid`, `SLAB_VOXELS` voxels at a time; `on_progress(fraction)` is called after each slab."""
     write_slabs(path, grid, slabs_of(obj, grid, slab_rows(grid), on_progress), of, beside)
 
 
@@ -239,8 +231,8 @@ OF, VIEWS, COPIES = "of", "views", "copies"
 
 
 def write_guess(path: Path, volume: Volume, spread: np.ndarray | None, of_copies: bool = False) -> None:
-    """Write δ and β that were guessed, as `write_volume` has them, and beside them /spread [Z, Y, X], the standard
-    deviation of occupancy, where there is one; of_copies: in guesses of copies of the scene."""
+    """Write guessed δ and β as `write_volume` does, and /spread [Z, Y, X], the standard deviation of occupancy, if
+    there is one; of_copies: in guesses of copies of the scene, else of its views."""
     with new_hdf5(path, 12 * volume.delta.size) as file:
         file.attrs.update({"voxel_size": np.array(volume.grid.voxel_size), "origin": np.array(volume.grid.origin)})
         for name in NAMES:

@@ -23,7 +23,7 @@ from ..mesh import TriangleMesh, part_of
 from ..units import LENGTH_UNITS, unit_factor
 from .atomic import atomic_path
 from .guard import blocks_fault, cells_fault, legacy_fault, ply_fault, xml_fault
-from .leftovers import is_hidden
+from .lock import is_hidden
 
 SUFFIXES = (".vtk", ".vtu", ".vtp")
 MERGE_TOLERANCE = 1e-6
@@ -106,13 +106,13 @@ def _files(path: Path) -> list[Path]:
     if path.is_dir():
         found = [file for file in path.iterdir() if file.suffix.lower() in SUFFIXES and not is_hidden(file)]
         require(len(found) > 0, f"{path} must hold mesh files ({', '.join(SUFFIXES)}), but it holds none.")
-        return sorted(found, key=_natural_order)
+        return sorted(found, key=_natural_order)  # cell2 comes before cell10
     require(path.exists(), f"{path} must be a mesh file, but there is no such file; check the path.")
     return [path]
 
 
 def _natural_order(file: Path) -> list[tuple[int, str]]:
-    """Numbers in names compare as numbers: cell2 comes before cell10."""
+    """Numbers in names compare as numbers."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", file.name)]
 
 
@@ -122,7 +122,9 @@ def _read_file(path: Path, factor: float) -> list[TriangleMesh]:
         if complaints():
             raise _damaged(path, complaints())
         surface = _surface(path, data)
-        points, faces = _checked_points(path, surface), _triangles(surface)
+        points, faces = numbers_of(surface.GetPoints().GetData()).astype(np.float64), _triangles(surface)
+        bad = int((~np.isfinite(points)).any(axis=1).sum())
+        require(bad == 0, f"{path}: point coordinates must be finite, but {bad} of {len(points)} points are not.")
         parts = _bodies(data, faces)
     if len(faces) == 0:
         raise InputError(f"{path} must hold triangles, strips or polygons, but its cells are points or lines.")
@@ -132,7 +134,8 @@ def _read_file(path: Path, factor: float) -> list[TriangleMesh]:
         f"{path} must hold a body of {SMALLEST:g} m or more, at most {FARTHEST:g} m from its origin, but it is of "
         f"{extent:.3g} m and reaches {farthest:.3g} m from it; correct its coordinates, or say their --length-unit.",
     )
-    whole = TriangleMesh(points * factor, faces, _readable(path.name))
+    name = os.fsencode(path.name).decode("utf-8", "replace")  # what is no UTF-8 in it becomes a sign for that
+    whole = TriangleMesh(points * factor, faces, name)
     named = [part_of(whole, part, name) for name, part in parts.items()] or [whole]
     meshes = [mesh.merged(MERGE_TOLERANCE * extent) for mesh in named]
     if _ends_within_a_line(path) and not all(_is_closed(mesh.faces) for mesh in meshes):
@@ -147,11 +150,6 @@ def _bodies(data: Any, faces: np.ndarray) -> dict[str, np.ndarray]:
         return {}
     of = numbers_of(numbers)
     return {f"{BODY}{number:03.0f}": faces[of == number] for number in np.unique(of)}
-
-
-def _readable(name: str) -> str:
-    """A file's name as text that every file and screen takes: what is no UTF-8 in it becomes a sign for that."""
-    return os.fsencode(name).decode("utf-8", "replace")
 
 
 def _damaged(path: Path, reason: str) -> InputError:
@@ -169,7 +167,10 @@ def _read_data(path: Path) -> Any:
     except OSError as error:
         raise InputError(f"{path} must be a readable file, but reading it failed: {error}.") from None
     if path.suffix.lower() in SOLIDS:
-        return _read_solid(path, content)
+        module, name = SOLIDS[path.suffix.lower()]
+        if fault := _solid_fault(path.suffix.lower(), content):
+            raise _damaged(path, fault)
+        return _output(getattr(import_module(f"vtkmodules.{module}"), name)(), path)
     xml = re.search(rb"<VTKFile[^>]*?\btype\s*=\s*[\"'](\w+)[\"']", content[:4096])
     kind = xml[1].decode() if xml else "legacy" if content.startswith(b"# vtk DataFile") else "none"
     readers = {
@@ -184,26 +185,22 @@ def _read_data(path: Path) -> Any:
         raise _damaged(path, "its closing tag </VTKFile> is missing")
     if fault := (xml_fault(content) or blocks_fault(content)) if xml else legacy_fault(content):
         raise _damaged(path, fault)
-    reader = readers[kind]()
+    return _output(readers[kind](), path)
+
+
+def _output(reader: Any, path: Path) -> Any:
+    """What a `reader` of VTK makes of the file at `path`."""
     reader.SetFileName(os.fsencode(path))
     reader.Update()
     return reader.GetOutput()
 
 
-def _read_solid(path: Path, content: bytes) -> Any:
-    """The data set of an STL, PLY or OBJ file; VTK does not see where a binary STL file was cut off."""
-    suffix = path.suffix.lower()
+def _solid_fault(suffix: str, content: bytes) -> str:
+    """The fault of an STL or PLY file; VTK does not see where a binary STL file was cut off."""
     if suffix == ".stl" and not content.lstrip().startswith(b"solid"):
         wanted = 84 + 50 * int.from_bytes(content[80:84], "little")
-        if len(content) < wanted:
-            raise _damaged(path, f"it has {len(content)} bytes of {wanted}")
-    if suffix == ".ply" and (fault := ply_fault(content)):
-        raise _damaged(path, fault)
-    module, name = SOLIDS[suffix]
-    reader = getattr(import_module(f"vtkmodules.{module}"), name)()
-    reader.SetFileName(os.fsencode(path))
-    reader.Update()
-    return reader.GetOutput()
+        return f"it has {len(content)} bytes of {wanted}" if len(content) < wanted else ""
+    return ply_fault(content) if suffix == ".ply" else ""
 
 
 def _surface(path: Path, data: Any) -> Any:
@@ -243,14 +240,6 @@ def _flat_cells(grid: Any) -> Any | None:
     surface.SetPoints(grid.GetPoints())
     (surface.SetStrips if STRIP in kinds else surface.SetPolys)(grid.GetCells())
     return surface
-
-
-def _checked_points(path: Path, surface: Any) -> np.ndarray:
-    """The surface's points [P, 3] in the file's unit, all finite."""
-    points = numbers_of(surface.GetPoints().GetData()).astype(np.float64)
-    bad = int((~np.isfinite(points)).any(axis=1).sum())
-    require(bad == 0, f"{path}: point coordinates must be finite, but {bad} of {len(points)} points are not.")
-    return points
 
 
 def _triangles(surface: Any) -> np.ndarray:

@@ -221,13 +221,7 @@ def carry_by_frames(window: Window, train: Scan, oversample: int) -> Forecast:
     later = [own[1:] for own in later]
     pairs = zip(later, window.meshes(-1))
     left = np.array([normal_distance(TriangleMesh(own[0], seen.faces), seen) for own, seen in pairs])
-    return replace(window.gone_on(later, left), told=_as_plain_numbers(found, options, len(start)))
-
-
-def _as_plain_numbers(found: Assimilated, options: Assimilation, cells: int) -> dict[str, float]:
-    """Plain numbers: peak and modulus, their relative standard errors, and the number of chosen unknowns."""
-    said = {"peak_m_s": float(found.unknowns.peak), "shear_n_m": float(found.unknowns.shear)}
-    said |= {f"{name}_told": value for name, value in found.told.items()}
-    said |= {"loss_before": found.losses[0], "loss_after": found.losses[1]}
-    count = options.unknowns(cells)
-    return said | ({"unasked": float(count)} if count > MOST_UNKNOWNS else {})
+    said = found.unknowns.as_dict(found.told) | {"loss_before": found.losses[0], "loss_after": found.losses[1]}
+    if (count := options.unknowns(len(start))) > MOST_UNKNOWNS:
+        said["unasked"] = float(count)
+    return replace(window.gone_on(later, left), told=said)

@@ -111,11 +111,6 @@ class Fitted:
     wrong: tuple[Tensor, Tensor]
     left: np.ndarray
 
-    def as_dict(self) -> dict[str, float]:
-        """Plain numbers."""
-        found = {"peak_m_s": float(self.unknowns.peak), "shear_n_m": float(self.unknowns.shear)}
-        return found | {f"{name}_told": value for name, value in self.told.items()}
-
 
 class _Unstable(Exception):
     """Nodes have left the reach of any smooth motion."""

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 from scipy.spatial import KDTree
+from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from ..baselines import HolographicTV, holographic_tv
@@ -20,7 +21,7 @@ from ..inference import Decision, Score, select
 from ..learning.network import Guess
 from ..learning.start import Guessed, LearnedStart, guess_matter, missing_thickness
 from ..matter import DeltaBeta, Matter
-from ..mesh import TriangleMesh
+from ..mesh import TriangleMesh, ball_radius
 from ..progress import Progress
 from ..ranges import Pixels, Weight, ranged
 from ..representations import MovingSurfaces, VoxelGrid
@@ -57,7 +58,7 @@ class Detection:
     @property
     def reach(self) -> float:
         """Radius [m] of a ball of its volume."""
-        return float((3 * abs(self.volume) / (4 * np.pi)) ** (1 / 3))
+        return ball_radius(abs(self.volume))
 
 
 @dataclass(frozen=True)
@@ -199,10 +200,10 @@ def apart(new: MovingSurfaces, known: MovingSurfaces, times: np.ndarray) -> list
     """
     distances = np.zeros((new.count, known.count))
     for time in times:
-        ours, theirs = ([_ball(mesh) for mesh in of.bodies(float(time))] for of in (new, known))
-        for i, (centre, radius) in enumerate(ours):
-            for j, (other, size) in enumerate(theirs):
-                distances[i, j] += np.linalg.norm(centre - other) / max(radius, size) / len(times)
+        ours, theirs = (of.bodies(float(time)) for of in (new, known))
+        centres, others = ([mesh.vertices.mean(0) for mesh in of] for of in (ours, theirs))
+        radii, sizes = ([ball_radius(abs(mesh.volume)) for mesh in of] for of in (ours, theirs))
+        distances += cdist(centres, others) / np.maximum.outer(radii, sizes) / len(times)
     middle = float(times[len(times) // 2])
     least = PART * np.median([abs(mesh.volume) for mesh in known.bodies(middle)])
     large = np.array([abs(mesh.volume) >= least for mesh in new.bodies(middle)])
@@ -245,11 +246,6 @@ def whole_ones(bodies: MovingSurfaces, times: np.ndarray) -> list[int]:
     touching = [] if not len(small) else gaps(only(bodies, small.tolist()), only(bodies, large.tolist()), times)
     pieces = {int(k) for k, gap in zip(small, touching) if gap <= NEAR_PX}
     return [k for k in range(bodies.count) if k not in pieces]
-
-
-def _ball(mesh: TriangleMesh) -> tuple[np.ndarray, float]:
-    """Middle of the vertices [3] [m], and radius [m] of the ball of the same volume."""
-    return mesh.vertices.mean(0), float((3 * abs(mesh.volume) / (4 * np.pi)) ** (1 / 3))
 
 
 MOST, LEAST = 0.5, 0.1

@@ -28,8 +28,8 @@ from .forecast import (
     History,
     Model,
     PathForecast,
+    error_at_end,
     extrapolate,
-    half_apart,
     left_of,
     of_volume,
     on_paths,
@@ -130,7 +130,7 @@ def carry(history: History, ahead: np.ndarray, options: DynamicsForecast) -> For
     later = window.model.run(window.meshes(-1), window.every, fitted.unknowns, fitted.wrong)
     for own, seen in zip(later, tracked):
         own += seen[-1] - own[0]  # what the coarse membrane does not follow
-    return replace(window.gone_on(later, fitted.left), told=fitted.as_dict())
+    return replace(window.gone_on(later, fitted.left), told=fitted.unknowns.as_dict(fitted.told))
 
 
 def window_of(history: History, ahead: np.ndarray, options: DynamicsForecast) -> Window:
@@ -213,9 +213,7 @@ def pooled(found: Sequence[Forecast], history: History) -> Forecast:
     Bodies keep the mean of the volumes, too.
     """
     times, bodies = np.r_[history.times[-1], found[0].times], history.bodies
-    state = np.zeros(bodies.count)
-    if history.halves is not None:
-        (state,) = half_apart(bodies, *(places_of(half, times[:1]) for half in history.halves))
+    state = error_at_end(history)
     square = np.stack([one.band for one in found]) ** 2
     own = np.maximum(square - state**2, np.maximum(LEAST_OWN * square, np.finfo(float).tiny))
     precision = np.where(np.isnan(square), 0.0, 1 / own)  # none, where nothing tells the error

@@ -7,8 +7,10 @@ so that a body twice as large and deformed alike costs as much.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -79,26 +81,41 @@ class _Energy(torch.autograd.Function):
         return -ctx.forces * gradient[..., None, None], None
 
 
-class RestShapeKept:
-    """Σ over bodies of the mean over time of their elastic energy beside their rest shape."""
+COEFFICIENTS = "object.coefficients"
 
-    names = ("rest_shape",)
+
+class OfPaths(ABC):
+    """A term of a fit of bodies in motion: one part, `name`, of their paths."""
+
+    def __init__(self, name: str, weight: float) -> None:
+        self.names, self._weight, self.resolved = (name,), weight, {name: weight}
+
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
+        """The one part."""
+        return [LossPart(self.names[0], self._weight, self.value(model.parameters()[COEFFICIENTS], batch))]
+
+    @abstractmethod
+    def value(self, paths: Tensor, batch: Batch) -> Tensor:
+        """[] of the coefficients `paths` [K, P, 3] [pixels]."""
+
+
+class RestShapeKept(OfPaths):
+    """Σ over bodies of the mean over time of their elastic energy beside their rest shape."""
 
     def __init__(self, weight: float, elastic: Elastic, start: MovingSurfaces) -> None:
         """elastic: of a mesh in pixels, of which all bodies of `start` have the vertices, in its order."""
+        super().__init__("rest_shape", weight)
         rest = elastic.membrane.rest
-        self._weight, self._elastic, self._count = weight, elastic, start.count
+        self._elastic, self._count = elastic, start.count
         faces = torch.cat([rest.faces + k * len(elastic.membrane.mesh.vertices) for k in range(start.count)])
         require(torch.equal(faces, start.faces), "bodies of a known rest shape must have its triangles.")
         instants = torch.linspace(start.basis.first, start.basis.last, start.basis.count + 1, dtype=torch.float64)
         self._weights = torch.from_numpy(start.basis.weights(instants.numpy()))
-        self.resolved = {"rest_shape": weight}
 
-    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
-        """The one part."""
-        paths = model.parameters()[COEFFICIENTS]
+    def value(self, paths: Tensor, batch: Batch) -> Tensor:
+        """As the class says."""
         nodes = torch.einsum("tk,kpx->tpx", self._weights, paths).unflatten(1, (self._count, -1))
-        return [LossPart("rest_shape", self._weight, self._elastic(nodes).mean(0).sum())]
+        return self._elastic(nodes).mean(0).sum()
 
 
 RED_CELL = Elasticity(global_area=0.0, volume=0.0)
@@ -128,81 +145,60 @@ def strain_energy(
     return np.array(found)
 
 
-COEFFICIENTS = "object.coefficients"
-
 Size = Callable[[Tensor, Tensor, Tensor], Tensor]
 """What triangles of the corners a, b, c [F, 3] add to a size of a body: [F]."""
 
 
-class MovingBending:
+class MovingBending(OfPaths):
     """The mean over times of Σ |L² x|² of the vertices x [pixels], L x their distance from their neighbours' mean."""
-
-    names = ("bending",)
 
     def __init__(self, weight: float, start: MovingSurfaces, times: np.ndarray) -> None:
         """times: [T] s, over which the mean is taken."""
+        super().__init__("bending", weight)
         count = start.coefficients.shape[1]
         away = csr_array(eye_array(count) - neighbour_mean(start.faces.numpy(), count))
         operator = csr_array(away @ away)
-        self._weight, self._operators = weight, (operator, csr_array(operator.T))
+        self._operators = operator, csr_array(operator.T)
         self._root = torch.from_numpy(square_root(start.basis.gram(times)))
-        self.resolved = {"bending": weight}
 
-    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
-        """The one part."""
-        paths = torch.einsum("kl,lpx->pkx", self._root, model.parameters()[COEFFICIENTS])
-        return [LossPart("bending", self._weight, squared_product(paths.flatten(1), *self._operators))]
+    def value(self, paths: Tensor, batch: Batch) -> Tensor:
+        """As the class says."""
+        return squared_product(torch.einsum("kl,lpx->pkx", self._root, paths).flatten(1), *self._operators)
 
 
-class Acceleration:
+class Acceleration(OfPaths):
     """The mean over vertices of the squared coefficients of their acceleration [pixels² per piece⁴]."""
 
-    names = ("acceleration",)
-
     def __init__(self, weight: float, start: MovingSurfaces) -> None:
-        self._weight = weight
+        super().__init__("acceleration", weight)
         self._curvature = torch.from_numpy(start.basis.curvature())
-        self.resolved = {"acceleration": weight}
 
-    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
-        """The one part."""
-        paths = model.parameters()[COEFFICIENTS]
+    def value(self, paths: Tensor, batch: Batch) -> Tensor:
+        """As the class says."""
         bent: Tensor = torch.einsum("jk,kpx->jpx", self._curvature, paths)
-        return [LossPart("acceleration", self._weight, bent.square().sum() / paths.shape[1])]
+        return bent.square().sum() / paths.shape[1]
 
 
-class SizeKept:
+class SizeKept(OfPaths):
     """Σ over bodies of the mean over times of (S(t)/S - 1)², S(t) a size of a body and S its mean over time."""
 
     def __init__(self, name: str, size: Size, weight: float, start: MovingSurfaces, times: np.ndarray) -> None:
         """name: of the part; size: one number of each triangle, whose sum is that of the body; times: [T] s, over which
         means are taken."""
-        self.names, self._size, self._weight = (name,), size, weight
-        self._faces, self._body, self._count = start.faces, start.of_body, start.count
+        super().__init__(name, weight)
+        self._size, self._faces, self._body, self._count = size, start.faces, start.of_body, start.count
         self._weights = torch.from_numpy(start.basis.weights(times))
-        self.resolved = {name: weight}
 
-    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
-        """The one part."""
-        paths = model.parameters()[COEFFICIENTS]
+    def value(self, paths: Tensor, batch: Batch) -> Tensor:
+        """As the class says."""
         sizes = torch.stack([self._sizes(torch.einsum("k,kpx->px", w, paths)) for w in self._weights])
         change = sizes / sizes.mean(0) - 1
-        return [LossPart(self.names[0], self._weight, change.square().mean(0).sum())]
+        return change.square().mean(0).sum()
 
     def _sizes(self, vertices: Tensor) -> Tensor:
         """[B] of all bodies, about the middle of all vertices."""
         parts = self._size(*(vertices - vertices.detach().mean(0))[self._faces].unbind(1))
         return vertices.new_zeros(self._count).index_add(0, self._body, parts)
-
-
-def volume_kept(weight: float, start: MovingSurfaces, times: np.ndarray) -> SizeKept:
-    """The penalty on changes of the volume of each body."""
-    return SizeKept("volume_kept", _tetrahedra, weight, start, times)
-
-
-def area_kept(weight: float, start: MovingSurfaces, times: np.ndarray) -> SizeKept:
-    """The penalty on changes of the area of each body."""
-    return SizeKept("area_kept", _triangles, weight, start, times)
 
 
 def _tetrahedra(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
@@ -215,13 +211,19 @@ def _triangles(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
     return 0.5 * torch.linalg.cross(b - a, c - a).norm(dim=1)
 
 
+volume_kept = partial(SizeKept, "volume_kept", _tetrahedra)
+"""The penalty on changes of the volume of each body, of a weight, a start and times."""
+area_kept = partial(SizeKept, "area_kept", _triangles)
+"""The same of its area."""
+
+
 def square_root(gram: np.ndarray) -> np.ndarray:
     """R [K, K] with Rᵀ R = `gram` [K, K], positive semi-definite."""
     values, axes = np.linalg.eigh(gram)
     return np.sqrt(np.maximum(values, 0))[:, None] * axes.T
 
 
-class Apart:
+class Apart(OfPaths):
     """The mean over times of Σ over surfaces ∫ d² dA [pixels⁴], d the depth of a point in another body.
 
     The depth of a vertex is its distance from the tangent plane at the nearest vertex of the other body (whose normal
@@ -229,26 +231,23 @@ class Apart:
     not meet are not looked at; areas are those of the start. A step looks at the times of its own frames.
     """
 
-    names = ("apart",)
-
     def __init__(self, weight: float, start: MovingSurfaces, times: np.ndarray) -> None:
         """times: [N] s, of the frames."""
-        self._weight, self._basis, self._times = weight, start.basis, times
+        super().__init__("apart", weight)
+        self._basis, self._times = start.basis, times
         self._vertices = [start.body(k)[0].numpy() for k in range(start.count)]
         self._faces = start.faces
         corners = start.at(start.basis.first).vertices.detach()[start.faces]
         areas = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).norm(dim=1) / 6
         self._areas = torch.zeros(start.coefficients.shape[1], dtype=torch.float64)
         self._areas.index_add_(0, start.faces.reshape(-1), areas.repeat_interleave(3))
-        self.resolved = {"apart": weight}
 
-    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
-        """The one part."""
-        paths = model.parameters()[COEFFICIENTS]
+    def value(self, paths: Tensor, batch: Batch) -> Tensor:
+        """As the class says."""
         shown = self._times if batch.index is None else self._times[batch.index.numpy()]
         times = np.unique(shown)
         places = (torch.einsum("k,kpx->px", torch.from_numpy(w), paths) for w in self._basis.weights(times))
-        return [LossPart("apart", self._weight, torch.stack([self.overlap(vertices) for vertices in places]).mean())]
+        return torch.stack([self.overlap(vertices) for vertices in places]).mean()
 
     def overlap(self, vertices: Tensor) -> Tensor:
         """Σ ∫ d² dA [] of surfaces with `vertices` [P, 3] [pixels], over the parts that lie in other bodies."""
@@ -257,7 +256,7 @@ class Apart:
         if not found:
             return vertices.new_zeros(())
         own, other = (torch.from_numpy(np.concatenate(part)) for part in zip(*found))
-        depth = -((vertices[own] - vertices[other]) * self._normals(vertices)[other]).sum(1)
+        depth = -((vertices[own] - vertices[other]) * vertex_normals(vertices, self._faces)[other]).sum(1)
         return (self._areas[own] * depth.clamp_min(0).square()).sum()
 
     def _near(self, points: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -272,9 +271,11 @@ class Apart:
                 if i != j and len(inside):
                     yield self._vertices[i][inside], self._vertices[j][tree.query(bodies[i][inside])[1]]
 
-    def _normals(self, vertices: Tensor) -> Tensor:
-        """Unit normals [P, 3], means of those of the triangles around by area."""
-        a, b, c = vertices[self._faces].unbind(1)
-        across = torch.linalg.cross(b - a, c - a)
-        sums = torch.zeros_like(vertices).index_add(0, self._faces.reshape(-1), across.repeat_interleave(3, 0))
-        return sums / sums.norm(dim=1, keepdim=True).clamp_min(1e-30)
+
+def vertex_normals(places: Tensor, faces: Tensor) -> Tensor:
+    """[..., P, 3] unit normals at the vertices, means of those of their triangles by area."""
+    a, b, c = places[..., faces, :].unbind(-2)
+    across = torch.linalg.cross(b - a, c - a)
+    index = faces.T.reshape(-1)
+    found = torch.zeros_like(places).index_add(-2, index, torch.cat([across, across, across], dim=-2))
+    return torch.nn.functional.normalize(found, dim=-1)

@@ -17,7 +17,6 @@ from ..fit.loop import Fit, Plan
 from ..fit.optimiser import Adam, Group, Leaves, Optimiser
 from ..fit.problem import Problem, Schedule, Term
 from ..fit.projected_gradient import QuasiNewton
-from ..fit.residuals import Prediction
 from ..fit.run import Run
 from ..fit.terms import Objective
 from ..inference import Compared, Decision, Score
@@ -29,6 +28,7 @@ from ..ranges import Rate, Weight, ranged
 from ..representations import MovingSurfaces
 from ..representations.isosurface import adjacency
 from ..scan import Scan
+from .detections import predicted
 from .elastic import COEFFICIENTS, Acceleration, Apart, MovingBending, Rest, RestShapeKept, area_kept, volume_kept
 
 OPEN = 1e-3
@@ -110,6 +110,14 @@ def motion_fit(
         judge=base.judge,
     )
     return Fit(plan, seed)
+
+
+def fitted_bodies(fit: Fit) -> MovingSurfaces:
+    """The bodies of a `motion_fit` that goes on to its end."""
+    fit.run(lambda record: None)
+    found = fit.result().object
+    assert isinstance(found, MovingSurfaces)
+    return found
 
 
 def _terms(base: Ground, start: MovingSurfaces, options: MotionFit) -> list[Term]:
@@ -223,11 +231,12 @@ def chosen_paths(
     run = run or Run()
 
     def tried(bodies: MovingSurfaces) -> tuple[torch.Tensor, torch.Tensor]:
-        fit = motion_fit(kept, bodies, short, seed, _part(light, ~aside), rest)
-        fit.run(lambda record: None)
-        found = fit.result().object
-        assert isinstance(found, MovingSurfaces)
-        return found.coefficients.detach(), _left(left, found, fit.oversample)
+        part = light and light.part(torch.from_numpy(np.flatnonzero(~aside)))
+        fit = motion_fit(kept, bodies, short, seed, part, rest)
+        found = fitted_bodies(fit)
+        missed = Score.of(torch.from_numpy(predicted(left, found, fit.oversample) - left.frames)).powers
+        # one block a frame: frames differ by more than their parts do
+        return found.coefficients.detach(), torch.from_numpy(missed).unflatten(0, (len(left), -1)).mean(dim=1)
 
     def fitted(bodies: MovingSurfaces) -> tuple[MovingSurfaces, Score]:
         coefficients, left = run.step("paths", lambda: tried(bodies))
@@ -253,15 +262,3 @@ def refined(start: MovingSurfaces, pieces: int) -> MovingSurfaces:
     places = np.einsum("tk,kpx->tpx", weights, start.coefficients.detach().numpy())
     paths = torch.from_numpy(basis.fitted(times, places))
     return MovingSurfaces(paths, start.faces, start.of_body, basis, start.unit_length, start.matter, start.lines)
-
-
-def _left(held_out: Scan, found: MovingSurfaces, oversample: int) -> torch.Tensor:
-    """Powers [V, K] of `Score` of the held-out frames, one block a frame: frames differ by more than their parts do."""
-    said, measured = Prediction(found, held_out.exposures, oversample), torch.from_numpy(held_out.frames)
-    with torch.no_grad():
-        left = torch.stack([said.view(v).frames()[0] - one for v, one in enumerate(measured)])
-    return torch.from_numpy(Score.of(left).powers).unflatten(0, (len(left), -1)).mean(dim=1)
-
-
-def _part(light: Light | None, kept: np.ndarray) -> Light | None:
-    return None if light is None else light.part(torch.from_numpy(np.flatnonzero(kept)))

@@ -154,7 +154,11 @@ class FlowSearch:
         self.run.state = self._state
         if saved := self.run.saved:
             with self.run.as_written():
-                self._take_up(saved)
+                self.history, self._strength = list(saved["history"]), float(saved["strength"])
+                self.decisions = [Decision.from_dict(one) for one in saved.get("decisions", ())]
+                self.prior = self.options.volume.prior.weakened(self._strength)
+                if "stage_steps" not in saved and (count := int(saved.get("steps", 0))):
+                    self.run.done = [*([None] * (count - 1)), saved]
 
     def by_itself(self, scan: Scan, name: str) -> VoxelGrid:
         """The volume of frames of one time; its prior is taken on."""
@@ -254,14 +258,6 @@ class FlowSearch:
                 return found
             reach *= 2
 
-    def _take_up(self, saved: Mapping[str, Any]) -> None:
-        """Go on where an earlier run ended; older versions kept the last step beside its number."""
-        self.history, self._strength = list(saved["history"]), float(saved["strength"])
-        self.decisions = [Decision.from_dict(one) for one in saved.get("decisions", ())]
-        self.prior = self.options.volume.prior.weakened(self._strength)
-        if "stage_steps" not in saved and (count := int(saved.get("steps", 0))):
-            self.run.done = [*([None] * (count - 1)), saved]
-
     def _state(self) -> dict[str, Any]:
         """What `_take_up` reads."""
         decisions = [one.as_dict() for one in self.decisions]
@@ -274,7 +270,7 @@ class FlowSearch:
         windows = self.windows()
         for n, window in enumerate(windows):
             self.task.on_progress("flow", n / (len(windows) + 3))
-            state = self._step("flow", lambda s=state, w=window: self.turns(self._whole(s, w), s))
+            state = self._step("flow", lambda s=state, w=window: self.turns(self.problem(w, self.factor, s), s))
         return self.finished(self.freer(state))
 
     def _step(self, name: str, make: Callable[[], _State]) -> _State:
@@ -285,10 +281,6 @@ class FlowSearch:
 
     def _initial_state(self) -> _State:
         return self._still(self.on(self.first(), self.factor))
-
-    def _whole(self, state: _State, window: Sequence[int] | range) -> FlowProblem:
-        """The frames of the times numbered `window`, with the matter of `state`."""
-        return self.problem(window, self.factor, state)
 
     def first(self) -> VoxelGrid:
         """The volume of the middle time; of all times, as if nothing moved, where noise hides a single one."""
@@ -365,7 +357,7 @@ class FlowSearch:
         left = [int(k) for k in np.flatnonzero((~keep).any(1))]
         if not left or how.most_final <= how.final:
             return how.final
-        large = self.problem(range(len(keep)), self.factor, state, keep)
+        large = self._problem_of_all(state, keep)
         state = self._finer(replace(state, u=descend(large, state.u, how.iterations)[0]))
         kept, aside = self.problem(range(len(keep)), 1, state, keep), self.problem(left, 1, state, ~keep)
         best, gain = iterations_that_predict(kept, aside, state.u, how.most_final)

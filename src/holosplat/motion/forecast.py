@@ -238,11 +238,7 @@ def _at(
     if not options.keep_volume:
         return found
     inside = np.linspace(window.first, window.last, 2 * window.degree + 1)
-    for k, split in enumerate(splits):
-        faces = bodies.body(k)[1].numpy()
-        usual = np.mean([TriangleMesh(one, faces).volume for one in split.places(inside, window)])
-        found[k] = np.array([of_volume(one, faces, float(usual)) for one in found[k]])
-    return found
+    return of_kept_volume(bodies, [split.places(inside, window) for split in splits], found)
 
 
 def of_volume(vertices: np.ndarray, faces: np.ndarray, volume: float) -> np.ndarray:
@@ -251,23 +247,23 @@ def of_volume(vertices: np.ndarray, faces: np.ndarray, volume: float) -> np.ndar
     return middle + share ** (1 / 3) * (vertices - middle) if share > 0 else vertices
 
 
-def of_kept_volume(bodies: MovingSurfaces, times: np.ndarray, places: Places) -> Places:
-    """`places` of each body, such that it has its mean volume at `times`."""
+def of_kept_volume(bodies: MovingSurfaces, usual: Places, places: Places) -> Places:
+    """`places` of each body, such that it has the mean volume of its `usual` ones."""
     found = []
-    for k, (before, later) in enumerate(zip(places_of(bodies, times), places)):
+    for k, (before, later) in enumerate(zip(usual, places)):
         faces = bodies.body(k)[1].numpy()
-        usual = float(np.mean([TriangleMesh(one, faces).volume for one in before]))
-        found.append(np.array([of_volume(one, faces, usual) for one in later]))
+        volume = float(np.mean([TriangleMesh(one, faces).volume for one in before]))
+        found.append(np.array([of_volume(one, faces, volume) for one in later]))
     return found
 
 
 def left_of(history: History, said: Places, spread: np.ndarray) -> np.ndarray:
     """[B] m² what the first places that are `said` of the last time, smooth ones of error `spread` [B] m, leave of the
     bodies there, as of `_beyond`."""
-    return _beyond(history, said, np.sqrt(np.maximum(_error_at_end(history) ** 2 - spread**2, 0)))
+    return _beyond(history, said, np.sqrt(np.maximum(error_at_end(history) ** 2 - spread**2, 0)))
 
 
-def _error_at_end(history: History) -> np.ndarray:
+def error_at_end(history: History) -> np.ndarray:
     """[B] m, standard error of the bodies at the last time; 0 without halves."""
     if history.halves is None:
         return np.zeros(history.bodies.count)
@@ -284,7 +280,7 @@ def _backtest(
     if len(early) <= degree or len(before.times) == len(history.times):
         return np.full(history.bodies.count, np.nan), 1.0
     said, spread = say(before.bodies, early, last, before.halves)
-    return _beyond(history, said, np.hypot(spread[0], _error_at_end(history))), float(last[0] - early[-1])
+    return _beyond(history, said, np.hypot(spread[0], error_at_end(history))), float(last[0] - early[-1])
 
 
 def _beyond(history: History, said: Places, noise: np.ndarray) -> np.ndarray:

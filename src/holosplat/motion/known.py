@@ -28,7 +28,7 @@ from ..representations import MovingSurfaces, TimeBasis
 from ..scan import Scan
 from .detections import beside, only, predicted
 from .elastic import Elastic, Rest
-from .fit import MotionFit, motion_fit
+from .fit import MotionFit, fitted_bodies, motion_fit
 
 SPREAD = (0.85, 1.0, 1.15)
 """Velocities of the search over that of all matter together: a channel's flow is slower at its walls."""
@@ -196,9 +196,7 @@ class Trials:
     def _fitted(self, frames: Scan, start: MovingSurfaces, how: MotionFit) -> Tried:
         def tried() -> tuple[torch.Tensor, torch.Tensor]:
             fit = motion_fit(frames, start, how, self.seed, self.light, self.rest)
-            fit.run(lambda record: None)
-            found = fit.result().object
-            assert isinstance(found, MovingSurfaces)
+            found = fitted_bodies(fit)
             left = Score.of(torch.from_numpy(frames.frames - predicted(frames, found, self.oversample)))
             return torch.from_numpy(left.powers), found.coefficients.detach()
 
@@ -283,7 +281,7 @@ def twinned(bodies: MovingSurfaces, number: int, beams: np.ndarray) -> MovingSur
     middle = twin_map(second_moments(_middle_mesh(bodies, number)), beams)
     places, times = [], np.linspace(basis.first, basis.last, SAMPLES * basis.count)
     for time in times:
-        mesh = _mesh(bodies, number, float(time))
+        mesh = bodies.bodies(float(time))[number]
         centre = moments(mesh)[1]
         matrix = map_near(second_moments(mesh), beams, middle)
         places.append(((mesh.vertices - centre) @ matrix.T + centre) / bodies.unit_length)
@@ -314,12 +312,8 @@ def _arms(bodies: MovingSurfaces, number: int) -> tuple[torch.Tensor, torch.Tens
     return own, middles, paths - middles
 
 
-def _mesh(bodies: MovingSurfaces, number: int, time: float) -> TriangleMesh:
-    return bodies.bodies(time)[number]
-
-
 def _middle_mesh(bodies: MovingSurfaces, number: int) -> TriangleMesh:
-    return _mesh(bodies, number, 0.5 * (bodies.basis.first + bodies.basis.last))
+    return bodies.bodies(0.5 * (bodies.basis.first + bodies.basis.last))[number]
 
 
 def _energy(bodies: MovingSurfaces, number: int, rest: Rest) -> float:

@@ -27,11 +27,12 @@ from torch import Tensor, nn
 from ..checks import InputError, as_written, require
 from ..io.atomic import atomic_path
 from ..learning.start import Card, card_of, size_of, tensors_of
-from ..mesh import TriangleMesh
+from ..mesh import TriangleMesh, ball_radius
 from ..ranges import ManyOrNone, Natural, ranged
 from ..specimens.flow.suspension import PLASMA_VISCOSITY
 from ..specimens.membrane.model import Elasticity
-from .forecast import Forecast, History, Model, half_apart, of_kept_volume, on_paths, places_of
+from .elastic import vertex_normals
+from .forecast import Forecast, History, Model, error_at_end, of_kept_volume, on_paths, places_of
 
 SHIPPED, VERSION = Path(__file__).with_name("flowing_cells.safetensors"), "dynamics 1"
 DEGREE = 4
@@ -221,15 +222,6 @@ def spread_of(found: Tensor, horizon: Tensor) -> Tensor:
     return ((powers**2) @ found.square()[..., None] + LEAST_SPREAD**2).sqrt()[..., 0]
 
 
-def vertex_normals(places: Tensor, faces: Tensor) -> Tensor:
-    """[..., P, 3] unit normals at the vertices, means of those of their triangles by area."""
-    a, b, c = places[..., faces, :].unbind(-2)
-    across_ = torch.linalg.cross(b - a, c - a)
-    index = faces.T.reshape(-1)
-    found = torch.zeros_like(places).index_add(-2, index, torch.cat([across_, across_, across_], dim=-2))
-    return nn.functional.normalize(found, dim=-1)
-
-
 def spread_nodes(places: np.ndarray, count: int) -> np.ndarray:
     """Numbers of `count` of the points [P, 3], each farthest from those before; all of them where there are fewer."""
     chosen, apart = [0], np.linalg.norm(places - places[0], axis=1)
@@ -325,17 +317,15 @@ def learned(history: History, ahead: np.ndarray, options: GraphForecast = GraphF
     if (halves := history.halves) is not None:
         both = [[State.of(one, faces[k], known) for k, one in enumerate(places_of(half, known))] for half in halves]
         states = [replace(one, noise=one.apart(*pair)) for one, *pair in zip(states, *both)]
-        (apart,) = half_apart(bodies, *(places_of(half, known[-1:]) for half in halves))
-        place = torch.tensor([max((a / one.radius) ** 2 - one.noise**2, 0.0) for a, one in zip(apart, states)])
+        apart = zip(error_at_end(history), states)
+        place = torch.tensor([max((a / one.radius) ** 2 - one.noise**2, 0.0) for a, one in apart])
     scene, radii = _scene(states, length)
     with torch.no_grad():
         found, spread = trained.network(scene)
         errors = trained.calibration * spread_of(spread.double(), horizon[1:])
-    said = []
-    for k, state in enumerate(states):
-        said.append(state.later(trained.network, found[k].double(), horizon).numpy())
+    said = [one.later(trained.network, told.double(), horizon).numpy() for one, told in zip(states, found)]
     if options.keep_volume:
-        said = of_kept_volume(bodies, known, said)
+        said = of_kept_volume(bodies, places, said)
     band = (radii[:, None] * (errors.square().mean(1) + place[:, None]).sqrt()).T.numpy()
     return Forecast(on_paths(bodies, np.r_[known[-1], ahead], said), ahead, band)
 
@@ -356,7 +346,7 @@ class State:
     def of(cls, places: np.ndarray, faces: np.ndarray, times: np.ndarray) -> State:
         """From places [T, P, 3] [m] at `times` [T] s."""
         scaled = 2 * (times - times[0]) / (times[-1] - times[0]) - 1
-        radius = (3 * abs(TriangleMesh(places[-1], faces).volume) / (4 * np.pi)) ** (1 / 3)
+        radius = ball_radius(abs(TriangleMesh(places[-1], faces).volume))
         fitted = legendre.legfit(scaled, places.reshape(len(times), -1), DEGREE) / radius
         whole = torch.from_numpy(fitted.reshape(DEGREE + 1, -1, 3)).transpose(0, 1)
         middle = whole.mean(0)

@@ -73,6 +73,12 @@ def measured(bodies: MovingSurfaces, exposures: Exposures) -> Iterator[Measures]
             yield measure(mesh, speed, float(time), number, views)
 
 
+def measured_columns(bodies: MovingSurfaces, exposures: Exposures) -> dict[str, np.ndarray]:
+    """The same by column, [T, B] of each body at each time."""
+    rows, times = list(measured(bodies, exposures)), len(np.unique(exposures.time))
+    return {name: np.array([getattr(row, name) for row in rows]).reshape(times, -1) for name in columns()}
+
+
 def measure(mesh: TriangleMesh, speed: np.ndarray, time: float, number: int, views: Views) -> Measures:
     """Measure one body whose vertices have the velocities `speed` [P, 3] [m/s]; views: those of its time."""
     volume, centre, second = moments(mesh)
@@ -178,7 +184,7 @@ def standard_errors(bodies: MovingSurfaces, halves: Sequence[MovingSurfaces], sc
     """
     if not halves:
         return {}
-    rows = [_table(one, scan) for one in (bodies, *halves)]
+    rows = [measured_columns(one, scan.exposures) for one in (bodies, *halves)]
     seen, found = rows[0]["in_field"], {}
     for column in columns():
         if column in NO_ERRORS:
@@ -188,12 +194,6 @@ def standard_errors(bodies: MovingSurfaces, halves: Sequence[MovingSurfaces], sc
         common = float((seen * own).sum() / seen.sum()) if seen.any() else float(own.mean())
         found[column] = np.sqrt(0.5 * own + 0.5 * common)
     return found
-
-
-def _table(bodies: MovingSurfaces, scan: Scan) -> dict[str, np.ndarray]:
-    rows: list[Measures] = list(measured(bodies, scan.exposures))
-    times = len(np.unique(scan.exposures.time))
-    return {name: np.array([getattr(row, name) for row in rows]).reshape(times, -1) for name in columns()}
 
 
 def half_fit(rest: Rest | None) -> MotionFit:

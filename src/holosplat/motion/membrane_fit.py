@@ -12,7 +12,7 @@ the first state: the time steps are even, and each is computed again on the way 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import ceil, sqrt
 
@@ -168,6 +168,11 @@ class Unknowns:
     def of(cls, peak: float, shear: float) -> Unknowns:
         """From plain numbers."""
         return cls(*(torch.tensor(value, dtype=torch.float64) for value in (peak, shear)))
+
+    def as_dict(self, told: Mapping[str, float]) -> dict[str, float]:
+        """Plain numbers, and standard errors after over those before, by name, that are `told`."""
+        found = {"peak_m_s": float(self.peak), "shear_n_m": float(self.shear)}
+        return found | {f"{name}_told": value for name, value in told.items()}
 
 
 class CellFlow:

@@ -11,6 +11,7 @@ import importlib
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, ClassVar
 
 import numpy as np
@@ -57,16 +58,14 @@ class ModesForecast:
             len(window) >= LEAST,
             f"--by {self.kind} must see {LEAST} times at least, but the run has {len(window)}; take --by paths.",
         )
-        one = WAYS[self.kind]
-        order = self.decided(history)
-        chosen = next(each for each in ORDERS[self.kind] if str(each) == order.choice)
+        one, chosen = WAYS[self.kind], self._orders[self.decided(history).choice]
 
         def say(
             bodies: MovingSurfaces, times: np.ndarray, ahead: np.ndarray, halves: Halves | None
         ) -> tuple[Places, np.ndarray]:
             def places(of: MovingSurfaces) -> Places:
                 found = _places(of, times, ahead, chosen, one)
-                return of_kept_volume(of, times, found) if self.keep_volume else found
+                return of_kept_volume(of, places_of(of, times), found) if self.keep_volume else found
 
             if halves is None:
                 return places(bodies), np.zeros((len(ahead), bodies.count))
@@ -80,23 +79,23 @@ class ModesForecast:
     def _windowed(self, times: np.ndarray) -> np.ndarray:
         return times[-self.window :] if self.window else times
 
+    @property
+    def _orders(self) -> dict[str, tuple[int, int]]:
+        """By their names in a decision."""
+        return {str(each): each for each in ORDERS[self.kind]}
+
     def decided(self, history: History) -> Decision:
         """The order that tells the last third of the times best from what is before, over all bodies."""
         before = history.before
         early, late = self._windowed(before.times), history.times[len(before.times) :]
         truth = places_of(history.bodies, late)
-        one = WAYS[self.kind]
-        kept = dict[str, Score]()
 
+        @cache
         def score(name: str, fold: int) -> Score:
-            if name not in kept:
-                order = next(each for each in ORDERS[self.kind] if str(each) == name)
-                said = _places(before.bodies, early, late, order, one)
-                kept[name] = Score(np.array([[((a - b) ** 2).mean()] for a, b in zip(said, truth)]))
-            return kept[name]
+            said = _places(before.bodies, early, late, self._orders[name], WAYS[self.kind])
+            return Score(np.array([[((a - b) ** 2).mean()] for a, b in zip(said, truth)]))
 
-        names = [str(each) for each in ORDERS[self.kind]]
-        return select("order of the modes", names, score, by="the last third of the run's times")
+        return select("order of the modes", list(self._orders), score, by="the last third of the run's times")
 
 
 @dataclass(frozen=True)

@@ -41,13 +41,9 @@ class Frames:
         """The frames of the time numbered k on pixels `factor` times larger; keep: [V] bool, which of them."""
         scan, noise = self.scans[k], self.noise[k]
         if keep is not None:
-            scan, noise = scan[np.flatnonzero(keep)], part_of(noise, np.flatnonzero(keep))
+            index = np.flatnonzero(keep)
+            scan, noise = scan[index], noise[torch.from_numpy(index)]
         return WhitenedFrames(scan.binned(factor), self.material, noise.binned(factor))
-
-
-def part_of(noise: NoiseModel, index: np.ndarray) -> NoiseModel:
-    """The noise of some of the frames."""
-    return noise[torch.from_numpy(index)]
 
 
 def merged(scan: Scan) -> Scan:

@@ -15,6 +15,7 @@ from ..fit.problem import Schedule
 from ..inference import Score, select
 from ..learning.start import LearnedStart
 from ..matter import DeltaBeta, Matter
+from ..mesh import ball_radius
 from ..ranges import Share, ranged
 from ..representations import MovingSurfaces, TimeBasis
 from .detections import Detection, SightingOptions
@@ -39,7 +40,7 @@ class Seen:
     @property
     def reach(self) -> float:
         """Radius [m] of a ball of its volume."""
-        return float((3 * self.volume / (4 * np.pi)) ** (1 / 3))
+        return ball_radius(self.volume)
 
 
 @dataclass(frozen=True)

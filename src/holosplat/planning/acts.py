@@ -178,8 +178,7 @@ def of_surfaces(exposures: Exposures, how: SurfaceOptions) -> Needs:
 
 
 def of_export(shape: tuple[int, int, int], suffix: str) -> Needs:
-    """What `export --volume` takes for δ and β on so many voxels, in a file or folder of this suffix: TIFF is written
-    whole, others slab by slab, and OME-Zarr at lower resolutions, too, by rows of chunks."""
+    """What `export --volume` takes: TIFF is written whole, others by slabs, OME-Zarr by rows of chunks, too."""
     voxels = math.prod(shape)
     slab, chunks = (
         min(voxels, max(rows, shape[0] * shape[2])) for rows in (SLAB_VOXELS, 2 * CHUNK * shape[0] * shape[2])
@@ -190,10 +189,7 @@ def of_export(shape: tuple[int, int, int], suffix: str) -> Needs:
 
 
 def of_growth(cells: int, nodes: int, snapshots: int, travel: float) -> Needs:
-    """What `grow` takes: the flow that all nodes give each other, two cells at a time, and a mesh for each snapshot.
-
-    nodes: of a cell; travel: how far the fastest fluid goes from one snapshot to the next [m].
-    """
+    """What `grow` takes; nodes: of a cell; travel: how far the fastest fluid goes from one snapshot to the next [m]."""
     steps = 2.4 * snapshots * travel / 1e-6
     seconds = 2 + 2.5e-8 * steps * (cells * nodes) ** 2
     disk = Room.node * nodes * cells * snapshots + 1e5
@@ -210,10 +206,8 @@ def of_dataset(simulated: Needs, shape: tuple[int, int], views: int, scenes: int
 
 
 def of_training(shape: tuple[int, int], views: int, network: str, size: Size, steps: int) -> Needs:
-    """Estimate resources of `train` for scenes of so many pixels, of which so many views are shown.
-
-    size: of the network of `--start learned`; those of the others are of one size.
-    """
+    """Estimate resources of `train` for scenes of so many pixels and shown views; size: of the network of `--start
+    learned`."""
     rows, columns = shape
     voxels = rows * columns**2
     if network == "start":

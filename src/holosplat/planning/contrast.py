@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from ..checks import finite, in_range, require
 from ..geometry import Views
 from ..matter import DeltaBeta
 from ..mesh import TriangleMesh
-from ..ranges import Metres, Pixels, Positive, Small, checked_dataclass
+from ..ranges import Metres, Positive, Share, Small, Within, checked_dataclass
 from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, checked_distance
 from ..units import wavelength, wavenumber
 
@@ -31,17 +31,14 @@ SAMPLES_A_PIXEL = 16
 """Finer than this the raster need not be: fringes far narrower than a pixel hardly change a pixel's mean."""
 COMFORTABLE, MOST_SAMPLES = 640, 2048
 """Samples along the raster's edge: up to the first it is `FINE`, beyond the second there is no frame."""
-MOST_PSF_PX, MOST_SOURCE_ANGLE = 1000.0, 1.0
 SPREAD = 0.9
 """The part of SNR² within `Visibility.spread`."""
 
 
 @dataclass(frozen=True)
 class Subject:
-    """The one object of a plan: a closed mesh [m] as it lies in the beam (along z), its filling and surroundings.
-
-    material, medium: of the object and of its surroundings; a medium of None is vacuum.
-    """
+    """The object of a plan: a closed mesh [m] as it lies in the beam (along z), of one material in a medium (None:
+    vacuum)."""
 
     mesh: TriangleMesh
     material: Material
@@ -91,18 +88,15 @@ class Setup:
     """Effective propagation distance, in the sample plane [m]; 0: in contact."""
     pixel_size: Small = 3.2e-6
     """Effective pixel size, in the sample plane [m]."""
-    psf_sigma_px: Pixels = 0.0
+    psf_sigma_px: Annotated[float, Within(0, 1000, unit="pixels")] = 0.0
     """Standard deviation of the detector's Gaussian point-spread function [pixels]."""
-    source_angle: float = 0.0
+    source_angle: Share = 0.0
     """Standard deviation of the Gaussian source, seen from the object [rad]; times the distance it is the blur."""
 
     def __post_init__(self) -> None:
         in_range("energy", self.energy_kev, *ENERGY_RANGE_KEV, unit="keV")
         checked_distance(self.distance)
         in_range("pixel size", self.pixel_size, *PIXEL_RANGE_M, unit="metres")
-        for name, high, unit in (("psf_sigma_px", MOST_PSF_PX, "pixels"), ("source_angle", MOST_SOURCE_ANGLE, "rad")):
-            value = getattr(self, name)
-            require(0 <= value <= high, f"{name} must lie between 0 and {high:g} {unit}, but it is {value:g}.")
 
     @property
     def fringe(self) -> float:
@@ -115,10 +109,8 @@ class Setup:
         return math.hypot(self.psf_sigma_px, self.source_angle * self.distance / self.pixel_size)
 
     def fresnel_number(self, radius: float) -> float:
-        """Fresnel number a²/(λz) of a half-width `radius` [m] (Goodman 2005, *Fourier Optics*, sect. 4.5.1).
-
-        It is infinite in contact.
-        """
+        """Fresnel number a²/(λz) of a half-width `radius` [m] (Goodman 2005, *Fourier Optics*, sect. 4.5.1); infinite
+        in contact."""
         return (radius / self.fringe) ** 2 if self.fringe else math.inf
 
 
@@ -170,7 +162,10 @@ def visibility(subject: Subject, setup: Setup) -> Visibility:
     raster = _raster(subject, setup)
     added = subject.contrast(setup.energy_kev)
     thickness, intensity = _frame(subject, setup, added, raster)
-    contrast = _seen_by_pixels(intensity - 1, 1 / raster.factor)
+    # The pixel about each sample averages by its transfer function `sinc(p fx) sinc(p fy)`.
+    frequencies = np.fft.fftfreq(raster.count), np.fft.rfftfreq(raster.count)
+    rows, columns = (np.sinc(raster.factor * f) for f in frequencies)
+    contrast = np.fft.irfft2(np.fft.rfft2(intensity - 1) * rows[:, None] * columns, s=intensity.shape)
     blocks, f = raster.count // raster.factor, raster.factor
     signal = signal_to_noise_squared(contrast)
     thickest, k = float(thickness.max()), wavenumber(setup.energy_kev)
@@ -239,16 +234,6 @@ def _frame(subject: Subject, setup: Setup, added: DeltaBeta, raster: _Raster) ->
     intensity = instrument.frames(LineIntegrals(depth[:, None], ((added.delta, added.beta),)))[0].numpy()
     my, mx = instrument.margin
     return depth[0, my : my + raster.count, mx : mx + raster.count].numpy(), intensity
-
-
-def _seen_by_pixels(image: np.ndarray, frequency_scale: float) -> np.ndarray:
-    """`image` [n, n] averaged over the square pixel about each sample; a sample is `frequency_scale` of a pixel.
-
-    The pixel's transfer function is `sinc(p fx) sinc(p fy)`, exact at the frequencies that the raster resolves.
-    """
-    n = len(image)
-    rows, columns = (np.sinc(f / frequency_scale) for f in (np.fft.fftfreq(n), np.fft.rfftfreq(n)))
-    return np.fft.irfft2(np.fft.rfft2(image) * rows[:, None] * columns, s=image.shape)
 
 
 def _spread(signal: np.ndarray, pitch: float) -> float:

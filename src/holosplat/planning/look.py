@@ -29,8 +29,7 @@ RELATIVE = (0.2, 5.0)
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Power of frames over spatial frequency: frequency [B] in cycles a pixel, power [B] of each sample, and that of
-    white noise as strong as the frames' noise."""
+    """Power of frames [B] at frequencies [B] in cycles a pixel, and that of white noise as strong as theirs."""
 
     frequency: np.ndarray
     power: np.ndarray
@@ -104,20 +103,15 @@ def looked(frames: np.ndarray) -> Look:
     small = torch.from_numpy(binned(frames, factor))
     air = find_air(small)
     level = float(small[air].mean()) if bool(air.any()) else float(small.median())
-    part = torch.from_numpy(_middle(frames) / np.float32(level if level > 0 else 1.0))
+    tops = [max(0, (n - MOST_PIXELS) // 2) for n in frames.shape[1:]]
+    rows, columns = (slice(top, top + MOST_PIXELS) for top in tops)
+    part = torch.from_numpy(frames[:, rows, columns] / np.float32(level if level > 0 else 1.0))
     noise = float(noise_levels(part).mean())
     contrast = float((part.double() - 1).square().mean().sqrt())
     least, most = np.quantile(small.numpy(), (0.001, 0.999))
     found = level if bool(air.any()) else None
     shown = _spectrum(part.double().numpy() - 1, noise)
     return Look(frames, found, float(air.double().mean()), level, noise, contrast, float(least), float(most), shown)
-
-
-def _middle(frames: np.ndarray) -> np.ndarray:
-    """The middle of frames, of at most `MOST_PIXELS` rows and columns."""
-    tops = [max(0, (n - MOST_PIXELS) // 2) for n in frames.shape[1:]]
-    rows, columns = (slice(top, top + MOST_PIXELS) for top in tops)
-    return frames[:, rows, columns]
 
 
 def _spectrum(contrast: np.ndarray, noise: float) -> Spectrum:

@@ -182,8 +182,8 @@ class Needs:
 
 @dataclass(frozen=True)
 class Seen:
-    """The properties of frames that change it (`scan_facts`). windows: sizes of windows, None for whole frames;
-    noisy: whether surfaces begin with Gaussians, and may take turns with a volume."""
+    """Properties of frames: sizes of windows (None: whole frames), and whether surfaces begin with Gaussians in
+    noise."""
 
     windows: Sizes | None = None
     noisy: bool = False
@@ -220,9 +220,18 @@ def _of_kind(sizes: Sizes, method: Method, matter: MatterKind | None, seen: Seen
     fit = of_fit(worked, _without_rounds(method) if seen.noisy else method, matter)
     if fit is None:
         return None
-    if seen.windows is not None:
-        fit = _judged(fit, sizes)
-    if seen.noisy and (more := _in_noise(worked, method, matter)):
+    if seen.windows is not None:  # the result is judged by whole frames
+        finer = sizes.waves(1)
+        judged, more = Costs.program + Costs.frames * sizes.pixels + Costs.judged * finer, Costs.judging * finer
+        least = fit.least_memory and max(fit.least_memory, judged)
+        most, disk = fit.most_seconds and fit.most_seconds + more, fit.disk + Costs.written * sizes.pixels
+        fit = Needs(max(fit.memory, judged), disk, fit.seconds + more, most, least)
+    is_body = isinstance(method, Surfaces) or (isinstance(method, Auto) and matter == "levels")
+    how = getattr(method, "gaussians", None) if is_body and seen.noisy else None
+    if isinstance(how, Gaussians):  # with which surfaces begin, on the pixels that they begin on
+        factor = how.coarse.factor((worked.rows, worked.columns))
+        coarse = replace(worked, rows=worked.rows // factor, columns=worked.columns // factor)
+        more = _gaussian_seconds(_fine(coarse, how.volume)[0], edges=True)
         fit = replace(fit, seconds=more, most_seconds=fit.seconds + Costs.turns * more)
     least = with_report(sizes, fit.least_memory) if fit.least_memory else 0.0
     return replace(fit, memory=with_report(sizes, fit.memory), least_memory=least)
@@ -236,8 +245,7 @@ def _coarse(sizes: Sizes) -> Sizes:
 
 
 def of_choice(sizes: Sizes, method: Auto) -> float:
-    """Seconds, at most, in which fits of both kinds to coarse frames decide, where first volumes do not
-    (`methods.illumination`, `methods.levels`)."""
+    """Seconds, at most, of fits of both kinds of matter to coarse frames (`methods.illumination`, `methods.levels`)."""
     if sizes.views < FEWEST:
         return 0.0
     coarse, folds = _coarse(sizes), MOST if sizes.views >= MANY else sizes.views
@@ -258,27 +266,6 @@ def _without_rounds(method: Method) -> Method:
         return replace(method, gaussians=_without_rounds(method.gaussians))
     assert isinstance(method, Gaussians)
     return replace(method, volume=replace(method.volume, corrections=0))
-
-
-def _judged(fit: Needs, whole: Sizes) -> Needs:
-    """A fit in windows, with the judging of its result by whole frames."""
-    finer = whole.waves(1)
-    judged, more = Costs.program + Costs.frames * whole.pixels + Costs.judged * finer, Costs.judging * finer
-    least, most = fit.least_memory and max(fit.least_memory, judged), fit.most_seconds and fit.most_seconds + more
-    return Needs(max(fit.memory, judged), fit.disk + Costs.written * whole.pixels, fit.seconds + more, most, least)
-
-
-def _in_noise(sizes: Sizes, method: Method, matter: MatterKind | None) -> float:
-    """Seconds of the Gaussians with which surfaces begin in noise, on the pixels that they begin on; 0 where there are
-    none."""
-    how = (
-        method.gaussians if isinstance(method, Surfaces) or (isinstance(method, Auto) and matter == "levels") else None
-    )
-    if how is None:
-        return 0.0
-    factor = how.coarse.factor((sizes.rows, sizes.columns))
-    coarse = replace(sizes, rows=sizes.rows // factor, columns=sizes.columns // factor)
-    return _gaussian_seconds(_fine(coarse, how.volume)[0], edges=True)
 
 
 def _gaussian_seconds(fine: float, edges: bool) -> float:
@@ -331,16 +318,16 @@ def _beside(sizes: Sizes, method: Method) -> Needs | None:
 
 
 def _bodies(sizes: Sizes, how: Gaussians, edges: bool) -> Needs:
-    """The same of Gaussians, and of surfaces cut out of them where there are `edges`.
-
-    Where surfaces of coarse pixels show the bodies, these are done sooner, and no fine volume is made.
-    """
+    """The same of Gaussians, and of surfaces cut out of them if there are `edges`; coarse pixels that show the bodies
+    spare a fine volume."""
     batch = how.fit.schedule.views_per_step
     fitted = replace(sizes, views=min(batch, sizes.views) if batch else sizes.views).waves()
     waves = max(Costs.waves * fitted, Costs.edges * sizes.waves(1) if edges else 0.0)
     begun = 0.0 if how.start == "random" else of_start(sizes, how.volume)
     count = how.random_count if how.start == "random" else min(how.max_start, how.start_per_pixel * sizes.pixels)
-    work = _work(sizes, how.volume) if how.volume.corrections or not edges else 0.0
+    steps = max(1.0, how.volume.few_views / max(1, sizes.views))  # few views have more steps a round,
+    few = 0.22 + 0.78 * min(sizes.views, 12) / 12  # and a fifth of a step does not depend on their number
+    work = _fine(sizes, how.volume)[0] * steps * few if how.volume.corrections or not edges else 0.0
     memory, seconds = max(begun, waves + Costs.gaussian * count), _gaussian_seconds(work, edges)
     plain, finer = Needs(memory, 14 * count, seconds), sizes.waves(1)
     steps = how.coarse.of_views(sizes.views)
@@ -356,13 +343,6 @@ def _bodies(sizes: Sizes, how: Gaussians, edges: bool) -> Needs:
     filled = min(MOST_GAUSSIANS, FULL * sizes.voxels)
     memory = max(memory, Costs.waves * finer + Costs.filling * filled)
     return Needs(memory, 14 * filled, max(seconds, near + 2e-7 * filled * sizes.views))
-
-
-def _work(sizes: Sizes, how: HolographicTV) -> float:
-    """Voxels of the rounds of agreement, as many as take the time of 12 views: few views have more steps a round, and
-    a fifth of a step does not depend on their number (128 × 128 pixels, one view)."""
-    steps = max(1.0, how.few_views / max(1, sizes.views))
-    return _fine(sizes, how)[0] * steps * (0.22 + 0.78 * min(sizes.views, 12) / 12)
 
 
 def _fine(sizes: Sizes, how: HolographicTV) -> tuple[int, int]:

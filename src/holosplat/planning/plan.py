@@ -5,14 +5,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
-from ..checks import in_range, positive, require
+from ..checks import in_range, require
 from ..geometry import Grid, Views
 from ..progress import Advance
-from ..ranges import Frequency, Natural, Photons, Seconds, checked_dataclass
+from ..ranges import Frequency, Natural, Photons, Positive, Within, checked_dataclass
 from ..scan import Exposures
 from .contrast import Setup, Subject, Visibility, visibility
 
@@ -23,6 +23,8 @@ WANTED_SNR = 5.0
 """Signal to noise of a certain detection (Rose 1948, J. Opt. Soc. Am. 38, 196)."""
 NEARLY = 0.9
 """The part of the best signal to noise that counts as nearly as good."""
+Side = Annotated[int, Within(1, 10**6)]
+"""Pixels along a side of a detector."""
 BYTES_A_VOXEL = 8
 """δ and β in single precision, as volume files hold them."""
 
@@ -33,17 +35,17 @@ class Recording:
 
     photons_per_pixel: Photons = 1000.0
     """Mean photons detected in a pixel without the object."""
-    views: Natural = 16
+    views: Annotated[int, Within(1, 10**6)] = 16
     """Number of directions over 180°, recorded at the same instant."""
-    detector: tuple[Natural, Natural] | None = None
+    detector: tuple[Side, Side] | None = None
     """(rows, columns) of a frame [pixels] (default: not given, so no field and no data rate)."""
     frame_rate: Frequency | None = None
     """Frames a second [Hz] (default: no rates are computed)."""
-    exposure: Seconds | None = None
+    exposure: Annotated[float, Within(0, 1e6, above=True, unit="seconds")] | None = None
     """Time with light in one frame, such as a pulse's length [s] (default: the whole frame)."""
-    velocity: float | None = None
+    velocity: Positive | None = None
     """Velocity of the object across the beam [m/s] (default: no motion is considered)."""
-    bit_depth: Natural = 16
+    bit_depth: Annotated[int, Within(1, 64)] = 16
     """Bits stored for a pixel."""
     frames: Natural = 1
     """Number of recorded instants."""
@@ -52,30 +54,12 @@ class Recording:
         from ..optics.noise import PHOTON_RANGE  # with torch, which takes long to load
 
         in_range("photons_per_pixel", self.photons_per_pixel, *PHOTON_RANGE)
-        for name, most in (("views", 10**6), ("frames", 10**9), ("bit_depth", 64)):
-            value = getattr(self, name)
-            require(1 <= value <= most, f"{name} must lie between 1 and {most:g}, but it is {value}.")
-        if self.detector is not None:
-            rows, columns = self.detector
-            inside = min(rows, columns) >= 1 and max(rows, columns) <= 10**6
-            require(inside, f"detector must be two counts from 1 to 1e+06, but it is {rows} × {columns}.")
-        for name, unit in (("frame_rate", "Hz"), ("exposure", "seconds"), ("velocity", "metres per second")):
-            if getattr(self, name) is not None:
-                positive(name, getattr(self, name), unit)
-        if self.frame_rate is not None and self.exposure is not None:
-            fits = self.exposure <= 1.000001 / self.frame_rate
+        if self.frame_rate and self.exposure:
             require(
-                fits,
+                self.exposure <= 1.000001 / self.frame_rate,
                 f"exposure must fit into a frame, but {self.exposure:g} s is longer than the {1 / self.frame_rate:g} s "
                 f"of one frame at {self.frame_rate:g} Hz.",
             )
-
-    @property
-    def light_time(self) -> float | None:
-        """Time with light in one frame [s]: the exposure, or else the frame; None if neither is known."""
-        if self.exposure is not None:
-            return self.exposure
-        return None if self.frame_rate is None else 1 / self.frame_rate
 
 
 @dataclass(frozen=True)
@@ -247,7 +231,8 @@ def _motion(setup: Setup, recording: Recording) -> Motion:
     if recording.velocity is None:
         return Motion(None, None, None, None)
     pixels_a_second = recording.velocity / setup.pixel_size
-    time, rate = recording.light_time, recording.frame_rate
+    rate = recording.frame_rate
+    time = recording.exposure or (1 / rate if rate else None)  # with light in one frame
     blur = None if time is None else pixels_a_second * time
     step = None if rate is None else pixels_a_second / rate
     return Motion(blur, step, 1 / pixels_a_second, pixels_a_second)
@@ -267,9 +252,8 @@ def _storage(setup: Setup, recording: Recording) -> Storage:
 def experiment(
     subject: Subject, setup: Setup, recording: Recording, side: int, least: int = 1
 ) -> tuple[MeshScene, Exposures, float]:
-    """The object, its exposures, and their photons a pixel: of the detector, but no more of it than holds the object
-    and four fringes at any turn about y, and `least` pixels along each side, on pixels joined until `side` of them lie
-    along the shorter side."""
+    """The object, its exposures and their photons a pixel, on the part of the detector that holds the object and four
+    fringes at any turn about y (`least` pixels along a side), with pixels joined to `side` along the shorter side."""
     from ..specimens.scene import MeshScene  # with torch, which takes long to load
 
     x, y, z = subject.extent
@@ -366,11 +350,8 @@ def survey(
     energies_kev: np.ndarray,
     on_progress: Advance = lambda fraction: None,
 ) -> Survey:
-    """Signal to noise of `subject` at all `distances` [Z] m and `energies_kev` [E], each with its own δ and β.
-
-    The photons a pixel are the same everywhere, and so are pixel and point-spread function (of `setup`);
-    `on_progress(fraction)` is called after each point.
-    """
+    """Signal to noise of `subject` at all `distances` [Z] m and `energies_kev` [E], with the same photons a pixel,
+    pixel and blur (of `setup`); `on_progress(fraction)` is called after each point."""
     from ..optics.noise import PHOTON_RANGE
 
     in_range("photons_per_pixel", photons_per_pixel, *PHOTON_RANGE)

@@ -102,22 +102,17 @@ def _silent(silent: bool) -> Iterator[None]:
 
 @contextmanager
 def _opened(loader: Loader, path: Path, given: Mapping[str, Any]) -> Iterator[Opened]:
-    """The scan with few flats and darks."""
+    """The scan with at most `FIELDS` flats and darks, the others being invalid."""
     if loader.opens is None:
         yield loader.read(path, given), None
         return
     with loader.opens(path, given) as file:
-        few = with_fields(replace(file, kinds=_with_few_fields(file.kinds)), given)
+        kinds = file.kinds.copy()
+        for kind in (FLAT, DARK):
+            numbers = file.numbers(kind)
+            kinds[np.setdiff1d(numbers, numbers[evenly(len(numbers), FIELDS)])] = INVALID
+        few = with_fields(replace(file, kinds=kinds), given)
         yield Scan.of(StoredFrames.of(few), few.exposures, few.is_test, few.provenance(), few.divided), file
-
-
-def _with_few_fields(kinds: np.ndarray) -> np.ndarray:
-    """The kinds [N] of frames with at most `FIELDS` flats and darks, the others being invalid."""
-    kept = kinds.copy()
-    for kind in (FLAT, DARK):
-        numbers = np.flatnonzero(kinds == kind)
-        kept[np.setdiff1d(numbers, numbers[evenly(len(numbers), FIELDS)])] = INVALID
-    return kept
 
 
 def _facts(path: Path, reading: Reading, loader: Loader, opened: Opened, unsaid: Unsaid) -> ScanFacts:
@@ -222,8 +217,7 @@ def _angles(scan: Scan, file: ScanFile | None, unsaid: Unsaid) -> dict[str, str]
 
 
 def opposite_likeness(views: Views, frames: np.ndarray) -> float | None:
-    """The correlation of a frame of `frames` [K, H, W] with the mirror image about the axis of one half a turn on; None
-    where there are no two such frames, or no columns of both."""
+    """Correlation of a frame of `frames` [K, H, W] with the mirrored one half a turn on; None without such two."""
     angles = angles_of(views)
     if angles is None or not views.has_one_pixel:
         return None
@@ -277,28 +271,19 @@ def can_be_seen(scan: Scan) -> bool:
 
 
 def seen_of(scan: Scan, method: Method, whole: bool = False) -> Seen:
-    """Measure the training frames of `scan`; nothing where all frames are too many, or of several times.
-
-    whole: whether a run works on whole frames whatever they show, as with free poses. Noise counts as white here, and
-    light as even: in other light windows hold whole frames.
-    """
+    """Measure the training frames of `scan`, if they are few and of one time. Noise counts as white, and light as even:
+    in other light windows hold whole frames. whole: whether a run works on whole frames in any case (free poses)."""
     if not can_be_seen(scan) or scan.is_series:
         return UNSEEN
     scan = scan.train().in_memory()
     noise = NoiseModel.white_only(noise_levels(scan.measured), scan.views.shape)
     windows = None if whole else windows_of(scan, noise)
     worked = scan if windows is None else windows.of(scan)
-    return Seen(None if windows is None else Sizes.of(worked.exposures), _is_noisy(worked, method))
-
-
-def _is_noisy(scan: Scan, method: Method) -> bool:
-    """Whether surfaces begin as they do in noise, on the pixels that they begin on (`methods.first_surfaces`)."""
-    gaussians = getattr(method, "gaussians", None)
-    if not isinstance(gaussians, Gaussians):
-        return False
-    factor = gaussians.coarse.factor(scan.views.shape)
-    coarse = scan.binned(factor) if factor > 1 else scan
-    return noise_share(coarse.measured) > gaussians.volume.noisy
+    gaussians, noisy = getattr(method, "gaussians", None), False
+    if isinstance(gaussians, Gaussians):  # on the pixels that surfaces begin on (`methods.first_surfaces`)
+        factor = gaussians.coarse.factor(worked.views.shape)
+        noisy = noise_share((worked.binned(factor) if factor > 1 else worked).measured) > gaussians.volume.noisy
+    return Seen(None if windows is None else Sizes.of(worked.exposures), noisy)
 
 
 BINNINGS, FEWEST_COLUMNS = range(2, 9), 11
@@ -307,7 +292,13 @@ BINNINGS, FEWEST_COLUMNS = range(2, 9), 11
 
 def smaller(exposures: Exposures, method: Method, matter: MatterKind | None) -> Iterator[tuple[str, Needs]]:
     """The same reconstruction on larger voxels in the start, and on larger pixels; how, and what it takes then."""
-    flag, coarse = _one_voxel_a_pixel(method)
+    flag, coarse = "", method  # none where the method has no such start
+    start = getattr(method, "volume", None)
+    if isinstance(start, HolographicTV) and isinstance(method, Gaussians | HolographicVoxels | Voxels | NeuralFields):
+        flag, coarse = "--set volume.refine=1", replace(method, volume=replace(start, refine=1))
+    elif isinstance(method, Auto | Surfaces):
+        gaussians = replace(method.gaussians, volume=replace(method.gaussians.volume, refine=1))
+        flag, coarse = "--set gaussians.volume.refine=1", replace(method, gaussians=gaussians)
     for factor in (1, *BINNINGS):
         if factor > 1 and exposures.views.shape[1] // factor < FEWEST_COLUMNS:
             return
@@ -324,15 +315,3 @@ def coarser(exposures: Exposures, of: Callable[[Exposures], Needs]) -> Iterator[
         if exposures.views.shape[1] // factor < FEWEST_COLUMNS:
             return
         yield f"--bin {factor}", of(on_larger_pixels(exposures, factor))
-
-
-def _one_voxel_a_pixel(method: Method) -> tuple[str, Method]:
-    """A method whose start has voxels of one pixel, and the flag that makes it so; none where it has no such start."""
-    start = getattr(method, "volume", None)
-    if isinstance(start, HolographicTV) and isinstance(method, Gaussians | HolographicVoxels | Voxels | NeuralFields):
-        return "--set volume.refine=1", replace(method, volume=replace(start, refine=1))
-    if isinstance(method, Auto | Surfaces):
-        gaussians = method.gaussians
-        coarse = replace(gaussians, volume=replace(gaussians.volume, refine=1))
-        return "--set gaussians.volume.refine=1", replace(method, gaussians=coarse)
-    return "", method

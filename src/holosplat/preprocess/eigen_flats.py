@@ -1,5 +1,4 @@
-"""Flat fields that change from frame to frame: their principal components beyond the noise, and the weights of these by
-which a corrected frame varies least."""
+"""Changing flat fields: their principal components, and the weights by which a corrected frame varies least."""
 
 from __future__ import annotations
 

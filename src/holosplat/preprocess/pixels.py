@@ -1,7 +1,5 @@
-"""Plain flat-fielding, and defective pixels: found by their levels in dark and flat frames, and filled from their
-neighbours. Frames of the wrong kind: a dark with the beam on, a flat with the sample in it, a projection without light
-or without the sample. Rings: faults that stay in their pixels in all projections, such as noise and dust of too few
-flats."""
+"""Flat-fielding; defective pixels, found in dark and flat frames and filled from their neighbours; frames of the wrong
+kind, such as a flat with the sample in it; rings, faults that stay in their pixels in all projections."""
 
 from __future__ import annotations
 
@@ -18,10 +16,8 @@ if TYPE_CHECKING:
 
 
 def relative_intensity(raw: np.ndarray, dark: np.ndarray | float, light: np.ndarray | float) -> np.ndarray:
-    """(raw - dark) / light: counts relative to the counts of the same light without an object, float64.
-
-    light: flat field less dark field, positive where it is used (see `unlit`).
-    """
+    """(raw - dark) / light: counts relative to the same light without an object, float64; light: flat less dark field,
+    positive."""
     return (raw - dark) / light
 
 
@@ -196,8 +192,7 @@ DIM = 10.0
 
 
 def thumbnail(frame: np.ndarray) -> np.ndarray:
-    """The middle of a frame [H, W], averaged over blocks of pixels to about `SIDE` rows and columns; few pixels that
-    are no numbers do not count."""
+    """A frame [H, W] averaged over blocks to about `SIDE` rows and columns; a few NaN do not count."""
     bad = ~np.isfinite(frame)
     if 0 < bad.mean() <= MOST_DEFECTS:
         frame = np.where(bad, np.median(frame[~bad]), frame)
@@ -209,11 +204,8 @@ def thumbnail(frame: np.ndarray) -> np.ndarray:
 
 
 def odd_darks(darks: np.ndarray, lit: float) -> np.ndarray:
-    """[n] bool: which of the darks [n, h, w] are nearer to the counts of the flats (`lit`) than to those of the darkest
-    one, or else unlike the others.
-
-    Of two that differ, both.
-    """
+    """[n] bool: which of the darks [n, h, w] are nearer to the flats' counts (`lit`) than to the darkest one, or unlike
+    the others; of two that differ, both."""
     levels = darks.mean(axis=(1, 2))
     bright = levels >= 0.5 * (levels.min() + lit)
     light = lit - float(np.median(levels[~bright])) if not bright.all() else 0.0
@@ -224,10 +216,8 @@ def odd_darks(darks: np.ndarray, lit: float) -> np.ndarray:
 
 
 def odd_flats(flats: np.ndarray) -> np.ndarray:
-    """[n] bool: which of the flats [n, h, w], less the dark, are unlike the others but for their brightness.
-
-    Of two of which one has no light, both.
-    """
+    """[n] bool: which of the flats [n, h, w], less the dark, have another pattern than the others; of two of which one
+    has no light, both."""
     levels = flats.mean(axis=(1, 2))
     finite = levels[np.isfinite(levels)]
     usual = float(np.median(finite)) if len(finite) else 0.0
@@ -243,8 +233,7 @@ def odd_flats(flats: np.ndarray) -> np.ndarray:
 
 
 def odd_brightness(flats: np.ndarray) -> np.ndarray:
-    """[n] float: the light of each of the flats [n, h, w], less the dark, in units of their median, 1 for those that
-    are as bright as the others."""
+    """[n] float: the light of flats [n, h, w], less the dark, over their median; 1 for usual ones."""
     levels = flats.mean(axis=(1, 2))
     levels = levels / np.median(levels) if len(levels) and np.median(levels) > 0 else np.ones(len(levels))
     return np.where(_unlike(levels[:, None, None], UNLIKE), levels, 1.0)
@@ -263,11 +252,8 @@ def faintly_odd(flats: np.ndarray) -> np.ndarray:
 
 
 def level_and_pattern(frame: np.ndarray) -> tuple[float, float]:
-    """The mean of a relative frame [h, w], and how much it varies beyond its noise (rms, in units of the mean), or else
-    as much as the noise hides.
-
-    The finest diagonal wavelets tell the noise.
-    """
+    """The mean of a relative frame [h, w], and how much it varies beyond its noise (rms, in units of the mean), or as
+    much as noise hides; the finest diagonal wavelets tell the noise."""
     finest = 0.5 * (frame[:-1, :-1] + frame[1:, 1:] - frame[:-1, 1:] - frame[1:, :-1])
     noise = float((finest**2).mean()) if finest.size else 0.0
     level, power = float(frame.mean()), max(float(frame.var()) - noise, 2 * noise / np.sqrt(frame.size))
@@ -275,11 +261,8 @@ def level_and_pattern(frame: np.ndarray) -> tuple[float, float]:
 
 
 def dark_or_empty(levels: np.ndarray, patterns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """[n] bool: which frames have no light beside the others, and which show no matter, where the others do.
-
-    levels, patterns: [n] as of `level_and_pattern`. Frames without matter are as bright as the others at least, and
-    their pattern is `TIMES` weaker.
-    """
+    """[n] bool: which frames have no light beside the others, and which show no matter: as bright as the others at
+    least, with a pattern `TIMES` weaker. levels, patterns: [n] as of `level_and_pattern`."""
     usual = float(np.median(levels))
     if len(levels) < 3 or usual <= 0:
         return np.zeros(len(levels), dtype=bool), np.zeros(len(levels), dtype=bool)

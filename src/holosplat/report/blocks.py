@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..frames import evenly
@@ -300,22 +299,6 @@ def explained_figure(found: Verdict) -> Figure:
     """Residual, noise and contrast by band (left), and the residual over what is allowed by view and band (right)."""
     figure = new_figure(WIDTH, 2.4)
     left, right, bar = figure.subplots(1, 3, width_ratios=[1.1, 1.0, 0.045])
-    _curves(left, found)
-    letter(left, 0, "By period")
-    over = found.residual / np.maximum(found.allowed, 1e-30)
-    drawn = right.imshow(
-        over, cmap="magma", vmin=0, vmax=LARGEST, aspect="auto", interpolation="nearest", origin="lower"
-    )
-    right.set_xticks(range(over.shape[1]), _labels(found))
-    right.tick_params(axis="x", labelrotation=40)
-    right.set(xlabel="shortest period (µm)", ylabel="training view")
-    right.set_yticks(*_views(len(over)))
-    letter(right, 1, "By view")
-    colour_bar(figure, drawn, bar, "residual / allowed", "max")
-    return figure
-
-
-def _curves(axes: Axes, found: Verdict) -> None:
     places = np.arange(found.residual.shape[1])
     rms = {
         name: np.sqrt(np.mean(np.square(getattr(found, name)), axis=0))
@@ -329,12 +312,24 @@ def _curves(axes: Axes, found: Verdict) -> None:
     }
     top = max(float(rms["contrast"].max()), float(rms["residual"].max()), 1e-12)
     for name, values in rms.items():
-        axes.plot(places, np.where(values > 1e-5 * top, values, np.nan), label=name, **how[name])
-    axes.set_yscale("log")
-    axes.set_xticks(places, _labels(found))
-    axes.tick_params(axis="x", labelrotation=40)
-    axes.set(xlabel="shortest period (µm)", ylabel="rms of coefficients")
-    axes.legend(loc="best")
+        left.plot(places, np.where(values > 1e-5 * top, values, np.nan), label=name, **how[name])
+    left.set_yscale("log")
+    left.set_xticks(places, _labels(found))
+    left.tick_params(axis="x", labelrotation=40)
+    left.set(xlabel="shortest period (µm)", ylabel="rms of coefficients")
+    left.legend(loc="best")
+    letter(left, 0, "By period")
+    over = found.residual / np.maximum(found.allowed, 1e-30)
+    drawn = right.imshow(
+        over, cmap="magma", vmin=0, vmax=LARGEST, aspect="auto", interpolation="nearest", origin="lower"
+    )
+    right.set_xticks(range(over.shape[1]), _labels(found))
+    right.tick_params(axis="x", labelrotation=40)
+    right.set(xlabel="shortest period (µm)", ylabel="training view")
+    right.set_yticks(*_views(len(over)))
+    letter(right, 1, "By view")
+    colour_bar(figure, drawn, bar, "residual / allowed", "max")
+    return figure
 
 
 def _labels(found: Verdict) -> list[str]:

@@ -41,7 +41,7 @@ from .style import (
     scientific,
     styled,
 )
-from .surface import Deviation, SurfaceImage, box_edges, camera, render_surface
+from .surface import Deviation, box_edges, camera, render_surface
 
 PLANES = (("xy", 0, ("x", "y")), ("xz", 1, ("x", "z")), ("zy", 2, ("z", "y")))
 """Orthogonal planes: name, the axis of [Z, Y, X] that is fixed, and what runs along columns and rows."""
@@ -58,7 +58,10 @@ def scene_figure(reconstruction: Volume, truth: Volume | None, material: float) 
         shown = [(*found, camera(), "Reconstruction"), (*found, turned, "Turned by 90°")]
         panels = PanelGrid(1, [1.0, 1.0], [1.12, 1.12], (), 0.8 * WIDTH)
     else:
-        paint = _deviation(truth, 0.5 * material)
+        colours = matplotlib.colormaps[SIGNED_MAP]
+        paint = Deviation(
+            truth.delta, (0.5 * material), max(truth.grid.voxel_size), lambda d: colours(0.5 + 0.5 * d)[:, :3]
+        )
         shown = [
             (truth, to_rgb(TRUE_SURFACE), camera(), "Truth"),
             (*found, camera(), "Reconstruction"),
@@ -68,7 +71,15 @@ def scene_figure(reconstruction: Volume, truth: Volume | None, material: float) 
     for i, (volume, colour, rotation, title) in enumerate(shown):
         axes = panels.axes[0][i]
         picture = render_surface(volume.delta, volume.grid, 0.5 * material, rotation, 512, colour)
-        _surface_panel(axes, picture, volume.grid)
+        half = 0.5 * picture.width
+        axes.imshow(
+            picture.rgba, extent=(-half, half, half, -half), zorder=2, interpolation="antialiased", aspect="auto"
+        )
+        axes.set_axis_off()
+        for points in box_edges(volume.grid, picture.rotation):
+            axes.plot(points[:, 0], points[:, 1], lw=0.5, color=INK, alpha=0.4, zorder=1)
+        axes.set(xlim=(-half, half), ylim=(1.24 * half, -half))  # room for the scale bar below the box
+        scale_bar(axes, 2 * half, INK, 0.03)
         letter(axes, i, title)
     if truth is not None:
         _deviation_bar(panels.figure, panels.axes[0][2], max(truth.grid.voxel_size))
@@ -85,23 +96,6 @@ def _deviation_bar(figure: Figure, axes: Axes, limit: float) -> None:
     inset.xaxis.set_ticks_position("top")
     inset.set_xticklabels([f"−{end:.3g}", "0", f"{end:.3g} {unit}"])
     inset.tick_params(length=2, width=0.4, pad=1.5)
-
-
-def _deviation(truth: Volume, level: float) -> Deviation:
-    """Colours by distance from the true surface, blue inside and red outside of it, up to one voxel."""
-    colours = matplotlib.colormaps[SIGNED_MAP]
-    return Deviation(truth.delta, level, max(truth.grid.voxel_size), lambda d: colours(0.5 + 0.5 * d)[:, :3])
-
-
-def _surface_panel(axes: Axes, shown: SurfaceImage, grid: Grid) -> None:
-    """The picture in its box."""
-    half = 0.5 * shown.width
-    axes.imshow(shown.rgba, extent=(-half, half, half, -half), zorder=2, interpolation="antialiased", aspect="auto")
-    axes.set_axis_off()
-    for points in box_edges(grid, shown.rotation):
-        axes.plot(points[:, 0], points[:, 1], lw=0.5, color=INK, alpha=0.4, zorder=1)
-    axes.set(xlim=(-half, half), ylim=(1.24 * half, -half))  # room for the scale bar below the box
-    scale_bar(axes, 2 * half, INK, 0.03)
 
 
 @styled

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
 
 from ..frames import evenly
 from ..optics.sampling import fringes
@@ -81,31 +80,21 @@ def _beside(
     its bar."""
     count, height, width = measured.shape
     panels = PanelGrid(count, [width] * 3, [height] * 3, (0, 1, 2))
-    images, colours, limits, name, said = third
-    for row, pixel in enumerate(pixels):
-        grey = _frame(panels, row, measured, labels[row], pixel)
-        lit = _light(panels, row, light, pixel)
-        axes = panels.axes[row][2]
-        shown = image_panel(axes, images[row], (pixel, pixel), colours, limits)
-        letter(axes, 3 * row + 2, name)
-    for column, (drawn, label) in enumerate(((grey, "relative intensity"), (lit, "light − 1 (%)"), (shown, said))):
-        panels.bar(drawn, column, (0, count - 1), label, "both")
+    limit = 100 * float(np.abs(light - 1).max()) or 1.0
+    columns = (
+        (measured, HOLOGRAM_MAP, grey_limits(measured), "Measured", "relative intensity"),
+        (100 * (light - 1), SIGNED_MAP, (-limit, limit), "Light in it", "light − 1 (%)"),
+        third,
+    )
+    for column, (images, colours, limits, name, said) in enumerate(columns):
+        for row, pixel in enumerate(pixels):
+            axes = panels.axes[row][column]
+            drawn = image_panel(axes, images[row], (pixel, pixel), colours, limits)
+            letter(axes, 3 * row + column, name if column else f"{name}, {labels[row]}")
+            if column == 0:
+                scale_bar(axes, width * pixel)
+        panels.bar(drawn, column, (0, count - 1), said, "both")
     return panels.figure
-
-
-def _frame(panels: PanelGrid, row: int, frames: np.ndarray, label: str, pixel_size: float) -> AxesImage:
-    axes = panels.axes[row][0]
-    drawn = image_panel(axes, frames[row], (pixel_size, pixel_size), HOLOGRAM_MAP, grey_limits(frames))
-    letter(axes, 3 * row, f"Measured, {label}")
-    scale_bar(axes, frames.shape[2] * pixel_size)
-    return drawn
-
-
-def _light(panels: PanelGrid, row: int, light: np.ndarray, pixel_size: float) -> AxesImage:
-    axes, limit = panels.axes[row][1], 100 * float(np.abs(light - 1).max()) or 1.0
-    drawn = image_panel(axes, 100 * (light[row] - 1), (pixel_size, pixel_size), SIGNED_MAP, (-limit, limit))
-    letter(axes, 3 * row + 1, "Light in it")
-    return drawn
 
 
 FRAMES_SHOWN = (0, 1)

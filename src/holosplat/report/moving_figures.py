@@ -60,7 +60,18 @@ def trajectories_figure(moving: Moving) -> Figure:
         corner, extent = (low[across], low[1]), (high[across] - low[across], high[1] - low[1])
         axes.add_patch(Rectangle(corner, *extent, fill=False, ec=INK, lw=0.8, ls=(0, (4, 2))))
         for k, colour in enumerate(colours):
-            _way(axes, moving, k, across, colour)
+            x, y = (UNIT * moving.tracks[f"{'xyz'[axis]}_m"][:, k] for axis in (across, 1))
+            axes.plot(x, y, color=colour, lw=0.7, alpha=0.6)
+            whole = moving.whole[:, k]
+            axes.plot(np.where(whole, x, np.nan), np.where(whole, y, np.nan), color=colour, lw=1.8)
+            axes.plot(x[-1:], y[-1:], "o", ms=3, color=colour)
+            for time, opacity in ((0, 0.07), (-1, 0.2)):
+                vertices = UNIT * moving.bodies.bodies(float(moving.times[time]))[k].vertices[:, [across, 1]]
+                outline = vertices[ConvexHull(vertices).vertices]
+                axes.add_patch(Polygon(outline, fc=(*colour, opacity), ec=(*colour, 3 * opacity), lw=0.5))
+            axes.annotate(
+                str(k), (x[-1], y[-1]), (3, 2), textcoords="offset points", fontsize=6, color=INK, annotation_clip=True
+            )
         margin = 0.15 * (high - low)
         axes.set(xlim=(low[across] - margin[across], high[across] + margin[across]))
         axes.set(ylim=(high[1] + margin[1], low[1] - margin[1]), aspect="equal", xlabel=f"{'xyz'[across]} (µm)")
@@ -68,22 +79,6 @@ def trajectories_figure(moving: Moving) -> Figure:
         if i == 0:
             axes.set_ylabel("y, the rotation axis (µm)")
     return figure
-
-
-def _way(axes: Axes, moving: Moving, body: int, across: int, colour: tuple[float, float, float]) -> None:
-    """The way of one body, thin where it is not whole in the field; a dot and its number at the last time."""
-    x, y = (UNIT * moving.tracks[f"{'xyz'[axis]}_m"][:, body] for axis in (across, 1))
-    axes.plot(x, y, color=colour, lw=0.7, alpha=0.6)
-    whole = moving.whole[:, body]
-    axes.plot(np.where(whole, x, np.nan), np.where(whole, y, np.nan), color=colour, lw=1.8)
-    axes.plot(x[-1:], y[-1:], "o", ms=3, color=colour)
-    for time, opacity in ((0, 0.07), (-1, 0.2)):
-        vertices = UNIT * moving.bodies.bodies(float(moving.times[time]))[body].vertices[:, [across, 1]]
-        outline = vertices[ConvexHull(vertices).vertices]
-        axes.add_patch(Polygon(outline, fc=(*colour, opacity), ec=(*colour, 3 * opacity), lw=0.5))
-    axes.annotate(
-        str(body), (x[-1], y[-1]), (3, 2), textcoords="offset points", fontsize=6, color=INK, annotation_clip=True
-    )
 
 
 @styled
@@ -212,8 +207,12 @@ def _picture(moving: Moving, k: int) -> np.ndarray:
     upright = high > wide  # panels side by side, or one over the other
     for i, (name, image, colours, limits) in enumerate(panels):
         place = (0.435 + 0.188 * i, 0.02, 0.183, 0.92) if upright else (0.44, 0.665 - 0.325 * i, 0.55, 0.265)
-        _frame(figure.add_axes(place), image, pixel, colours, limits, name)
-    return _pixels(figure)
+        axes = figure.add_axes(place)
+        image_panel(axes, image, (pixel, pixel), colours, limits)
+        axes.set_title(name, fontsize=7.5, pad=3)
+    canvas = figure.canvas
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()  # type: ignore[attr-defined]
 
 
 def _turned(axes: Axes, moving: Moving, k: int) -> None:
@@ -232,18 +231,6 @@ def _turned(axes: Axes, moving: Moving, k: int) -> None:
     axes.set_axis_off()
     left, right = axes.get_xlim()
     scale_bar(axes, 1e-6 * (right - left), INK, 0.03)
-
-
-def _frame(axes: Axes, image: np.ndarray, pixel: float, colours: str, limits: tuple[float, float], title: str) -> None:
-    image_panel(axes, image, (pixel, pixel), colours, limits)
-    axes.set_title(title, fontsize=7.5, pad=3)
-
-
-def _pixels(figure: Figure) -> np.ndarray:
-    """What is drawn, [H, W, 3] uint8."""
-    canvas = figure.canvas
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()  # type: ignore[attr-defined]
 
 
 COLOURS = "A body has the same colour and number in all figures. "

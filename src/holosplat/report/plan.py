@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -91,7 +94,8 @@ def _map_panel(figure: Figure, axes: Axes, survey: Survey) -> None:
     box = axes.get_position()
     bar_axes = figure.add_axes((box.x1 + 0.01, box.y0, 0.011, box.height))
     figure.colorbar(drawn, cax=bar_axes).outline.set_linewidth(0.4)  # type: ignore[operator]
-    _plain_log_ticks(bar_axes, low, high)
+    _log_ticks(bar_axes.yaxis, fine=high / low < 10**2.5)
+    bar_axes.yaxis.set_minor_locator(NullLocator())
     bar_axes.tick_params(length=2, width=0.4, pad=2)
     marks = [
         Line2D([], [], color=INK, lw=1.1, label="best distance at each energy"),
@@ -104,21 +108,17 @@ def _map_panel(figure: Figure, axes: Axes, survey: Survey) -> None:
     figure.legend(handles=marks, loc="lower left", bbox_to_anchor=(0.05, 0.0), ncols=len(marks), columnspacing=1.6)
 
 
-def _plain_log_ticks(axes: Axes, low: float, high: float) -> None:
-    """Ticks at 1, 2 and 5 times powers of ten on a logarithmic colour bar, as plain numbers."""
-    span = np.log10(high / low)
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if span < 2.5 else (1.0,)))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.yaxis.set_minor_locator(NullLocator())
+def _log_ticks(axis: Axis, fine: bool, text: Callable[[float], str] = "{:g}".format) -> None:
+    """Ticks of a logarithmic axis at powers of ten, and where it is `fine` at 2 and 5 times them, as `text`."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if fine else (1.0,)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: text(value)))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def _distance_axis(axes: Axes, distances: np.ndarray) -> None:
     axes.set_xscale("log")
     axes.set(xlabel="distance", xlim=(distances[0], distances[-1]))
-    decades = np.log10(distances[-1] / distances[0])
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if decades < 1.6 else (1.0,)))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: _distance(value)))
-    axes.xaxis.set_minor_formatter(NullFormatter())
+    _log_ticks(axes.xaxis, distances[-1] / distances[0] < 10**1.6, _distance)
 
 
 def _distance(metres: float) -> str:
@@ -140,7 +140,6 @@ def _distance_panel(axes: Axes, survey: Survey) -> None:
         axes.plot(survey.distances[best], survey.snr[e, best], "o", ms=3, color=colour, clip_on=False, zorder=5)
     _distance_axis(axes, survey.distances)
     _snr_axis(axes, survey)
-    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.03), borderaxespad=0.2)
 
 
 def _energy_panel(axes: Axes, survey: Survey) -> None:
@@ -151,25 +150,27 @@ def _energy_panel(axes: Axes, survey: Survey) -> None:
     axes.plot(survey.energies_kev[energy], survey.snr[energy, 0], "o", ms=3, color=CYCLE[0], clip_on=False, zorder=5)
     axes.set(xlabel="photon energy (keV)", xlim=(survey.energies_kev[0], survey.energies_kev[-1]))
     _snr_axis(axes, survey)
-    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.03), borderaxespad=0.2)
 
 
 def _snr_axis(axes: Axes, survey: Survey) -> None:
+    """The axis of signal to noise, and the legend beside the panel."""
     low, high = float(survey.snr.min()), float(survey.snr.max())
     axes.set_yscale("log")
     axes.set(ylabel="signal to noise", ylim=(0.8 * low, 1.6 * high))
-    if np.log10(high / low) < 2:
-        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.yaxis.set_minor_formatter(NullFormatter())
+    _log_ticks(axes.yaxis, fine=high / low < 100)
     if 0.8 * low < WANTED_SNR < 1.6 * high:
         axes.axhline(WANTED_SNR, color=FAINT, lw=0.8, ls=(0, (4, 2)))
+    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.03), borderaxespad=0.2)
 
 
 def _frame_panel(figure: Figure, axes: Axes, bar: Axes, survey: Survey) -> None:
     """The contrast of the pixels at the best point, the object on the corner of four."""
     setup, pixel = survey.setup, survey.setup.pixel_size
-    frame = _trimmed(survey.best_frame)
+    n = len(survey.best_frame)
+    rows, columns = np.nonzero(np.abs(survey.best_frame) > 0.05 * np.abs(survey.best_frame).max())
+    reach = int(np.ceil(np.abs(np.concatenate([rows, columns]) - 0.5 * (n - 1)).max()))
+    cut = max(0, n // 2 - reach - 2)
+    frame = survey.best_frame[cut : n - cut, cut : n - cut]
     scale, power = decimal_scale(float(np.abs(frame).max()))
     limit = float(np.abs(frame).max()) / scale
     drawn = image_panel(axes, frame / scale, (pixel, pixel), HOLOGRAM_MAP, (-limit, limit))
@@ -177,12 +178,3 @@ def _frame_panel(figure: Figure, axes: Axes, bar: Axes, survey: Survey) -> None:
     colour_bar(figure, drawn, bar, f"contrast ({power})" if power else "contrast")
     said = f"{setup.energy_kev:.3g} keV, {_distance(setup.distance)},\n{format_length(pixel)} pixels"
     axes.set_xlabel(said, labelpad=4)
-
-
-def _trimmed(frame: np.ndarray) -> np.ndarray:
-    """The middle [m, m] of `frame` [n, n], as far as its contrast is above 5 % of the greatest."""
-    n = len(frame)
-    rows, columns = np.nonzero(np.abs(frame) > 0.05 * np.abs(frame).max())
-    reach = int(np.ceil(np.abs(np.concatenate([rows, columns]) - 0.5 * (n - 1)).max()))
-    cut = max(0, n // 2 - reach - 2)
-    return frame[cut : n - cut, cut : n - cut]

@@ -18,7 +18,7 @@ from ..io.atomic import read_json
 from ..io.volumes import read_guess
 from ..methods import METHODS, learned
 from ..metrics import volume_scores
-from ..motion.measures import columns, measured
+from ..motion.measures import measured_columns
 from ..optics.background import Light
 from ..optics.sampling import views_seeing
 from ..projectors.voxels import voxel_line_integrals
@@ -264,8 +264,7 @@ def moving_of(
     predicted = render(done, scan.exposures[chosen])
     if light is not None:
         predicted = predicted * light.factor().numpy()[chosen]
-    rows = list(measured(done.object, scan.exposures))
-    tracks = {name: np.array([getattr(row, name) for row in rows]).reshape(len(times), -1) for name in columns()}
+    tracks = measured_columns(done.object, scan.exposures)
     grid = Grid.of_views(scan.views)
     middle, half = grid.centre, 0.5 * np.array(grid.shape[::-1]) * np.array(grid.voxel_size)
     box = (middle - half, middle + half)

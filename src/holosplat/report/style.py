@@ -95,6 +95,12 @@ def settings() -> dict[str, object]:
     }
 
 
+@functools.cache
+def palette() -> np.ndarray:
+    """Red, green and blue [256, 3] of `DELTA_MAP`, from dark to light, as whole numbers up to 255."""
+    return np.rint(255 * matplotlib.colormaps[DELTA_MAP](np.arange(256))[:, :3]).astype(int)
+
+
 def styled(function: Callable[P, T]) -> Callable[P, T]:
     """Run `function` under `settings()`, and leave matplotlib's own settings as they were."""
 

@@ -102,11 +102,11 @@ def render_surface(
     pixel = 2 * half / (2 * size)
     offsets = (np.arange(2 * size) + 0.5) * pixel - half
     x, y = (axis.ravel() for axis in np.meshgrid(offsets, offsets))
-    found, depth = _first_hits(field, rotation, x, y, _centre(grid))
+    found, depth = _first_hits(field, rotation, x, y, grid.centre)
     rgba = np.zeros((4 * size * size, 4), dtype=np.float32)
     if found.size:
         lab = np.stack([x[found], y[found], depth])
-        points = rotation.T @ lab + _centre(grid)[:, None]
+        points = rotation.T @ lab + grid.centre[:, None]
         rgba[found, :3] = _shade(field, points, lab[2] / half, rotation, colour)
         rgba[found, 3] = 1.0
     premultiplied = rgba.reshape(size, 2, size, 2, 4).mean(axis=(1, 3))
@@ -136,11 +136,6 @@ def _corners(grid: Grid) -> np.ndarray:
     return np.array(list(product((-1, 1), repeat=3))) * half
 
 
-def _centre(grid: Grid) -> np.ndarray:
-    steps = np.asarray(grid.voxel_size) * (np.asarray(grid.shape[::-1]) - 1)
-    return np.asarray(grid.origin) + 0.5 * steps
-
-
 def _field(values: np.ndarray, grid: Grid) -> _Field:
     padded = np.pad(values, 1)  # closes surfaces that the grid's faces cut
     per_metre = 1.0 / np.asarray(grid.voxel_size)
@@ -157,7 +152,11 @@ def _first_hits(
     distance = np.asarray(distance_transform_edt(~matter))  # in voxels; a cell with matter lies within √3
     start = rotation.T[:, :2] @ np.stack([x, y]) + centre[:, None]
     along = rotation.T[:, 2]
-    enter, leave = _box_span(field, start, along)
+    low = (0.0 - field.offset) / field.per_metre
+    high = (np.asarray(field.values.shape[::-1]) - 1.0 - field.offset) / field.per_metre
+    slope = np.where(np.abs(along) < 1e-12, 1e-12, along)[:, None]
+    a, b = (low[:, None] - start) / slope, (high[:, None] - start) / slope
+    enter, leave = np.minimum(a, b).max(axis=0), np.maximum(a, b).min(axis=0)
     active = np.flatnonzero(enter < leave)
     depth = enter.copy()
     hits = []
@@ -184,15 +183,6 @@ def _bisect(field: _Field, start: np.ndarray, along: np.ndarray, depth: np.ndarr
         inside = field.at(field.values, start + along[:, None] * middle) > 1.0
         high, low = np.where(inside, middle, high), np.where(inside, low, middle)
     return high
-
-
-def _box_span(field: _Field, start: np.ndarray, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Depths [m] at which rays enter and leave the padded volume (slab method, Kay & Kajiya 1986)."""
-    low = (0.0 - field.offset) / field.per_metre
-    high = (np.asarray(field.values.shape[::-1]) - 1.0 - field.offset) / field.per_metre
-    slope = np.where(np.abs(along) < 1e-12, 1e-12, along)[:, None]
-    a, b = (low[:, None] - start) / slope, (high[:, None] - start) / slope
-    return np.minimum(a, b).max(axis=0), np.maximum(a, b).min(axis=0)
 
 
 def _shade(
@@ -286,8 +276,8 @@ def paint_bodies(
 
 def _shaded(colour: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """RGB [F, 3] of faces with unit `normals` [F, 3] in the lab frame: two lights, a gloss, a dark rim."""
-    key, fill = (np.array(light) / np.linalg.norm(light) for light in (KEY_LIGHT, FILL_LIGHT))
-    halfway = (key + [0.0, 0.0, -1.0]) / np.linalg.norm(key + [0.0, 0.0, -1.0])
+    key, fill = _unit(KEY_LIGHT), _unit(FILL_LIGHT)
+    halfway = _unit(key + [0.0, 0.0, -1.0])
     bright = 0.42 + 0.62 * np.clip(normals @ key, 0, 1) + 0.18 * np.clip(normals @ fill, 0, 1)
     bright *= 1 - 0.45 * (1 - np.clip(-normals[:, 2], 0, 1)) ** 3
     gloss = 0.12 * np.clip(normals @ halfway, 0, 1) ** 30

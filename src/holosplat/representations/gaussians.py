@@ -16,13 +16,13 @@ from ..display import of_object
 from ..geometry import Grid, Poses, Views
 from ..matter import Matter
 from ..projectors.splat import splat, voxelise
-from ..volume import LineIntegrals, Volume
+from ..volume import LineIntegrals, Unmoved, Volume
 
 PARAMETERS = ("centres", "log_scales", "quaternions", "raw_amplitudes")
 """The names of the trainable tensors."""
 
 
-class GaussianCloud:
+class GaussianCloud(Unmoved):
     """N Gaussians; `n(x) - 1` is the sum of `a exp(-½ (x-c)ᵀ Σ⁻¹ (x-c))`, `Σ = R(q) diag(s²) R(q)ᵀ`.
 
     Parameters are float32 tensors in units of `unit_length` [m], the scan's pixel size, so that they are of
@@ -118,10 +118,6 @@ class GaussianCloud:
     def enclosing_grid(self, most_voxels: int) -> Grid:
         """A grid around all centres, of `unit_length` a voxel, or coarser where those would be over `most_voxels`."""
         return Grid.around(self.centres.detach().double().cpu().numpy(), self.unit_length, most_voxels)
-
-    def at(self, time: float) -> GaussianCloud:
-        """The cloud itself: it does not move."""
-        return self
 
     def thickness(self, views: Views | Poses) -> Tensor:
         """Line integrals [V, C, H, W] of the amplitudes, in units of `unit_length`.

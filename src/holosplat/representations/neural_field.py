@@ -22,7 +22,7 @@ from ..geometry import Grid, Poses, Views
 from ..matter import Matter
 from ..ranges import checked_dataclass
 from ..tables import from_table, to_table
-from ..volume import LineIntegrals, Volume
+from ..volume import LineIntegrals, Unmoved, Volume
 from .perceptron import Encoding
 from .voxels import resampling
 
@@ -86,7 +86,7 @@ class Perceptron(nn.Module):
         return self.output(found)
 
 
-class NeuralField:
+class NeuralField(Unmoved):
     """A field of matter on the box of `grid` (cubic voxels), zero where `mask` [Z, Y, X] says that nothing is.
 
     upper: the largest occupancy of a single material, `upper · sigmoid` of the network's output (0: its softplus,
@@ -209,10 +209,6 @@ class NeuralField:
     def raw(self, positions: Tensor) -> Tensor:
         """Output of the network [N, C + `beside`] at the same positions."""
         return functional_call(self._net, {**self._weights, **self._constants}, (positions,))
-
-    def at(self, time: float) -> NeuralField:
-        """The field itself: it does not move."""
-        return self
 
     def raster(self, views: AnyViews) -> AnyViews:
         """The same views on pixels of a voxel edge, a whole number of them where `views` hold one.

@@ -17,11 +17,11 @@ from ..geometry import Grid, Poses, Views
 from ..matter import DeltaBeta, Matter
 from ..mesh import TriangleMesh, joined, part_of, shell_labels, winding_number
 from ..projectors.surface import surface_occupancy, surface_thickness
-from ..volume import LineIntegrals, Volume
+from ..volume import LineIntegrals, Unmoved, Volume
 from .flow import TimeBasis, path_positions
 
 
-class SurfaceMesh:
+class SurfaceMesh(Unmoved):
     """Closed triangle surfaces, filled with one material or several; the vertices are trainable.
 
     vertices: [P, 3] float64 `(x, y, z)` in units of `unit_length` [m], the scan's pixel size; faces: [F, 3] int64,
@@ -111,10 +111,6 @@ class SurfaceMesh:
     def enclosing_grid(self, most_voxels: int) -> Grid:
         """A grid around all vertices, of `unit_length` a voxel, or coarser where those would be over `most_voxels`."""
         return Grid.around(self.vertices.detach().cpu().numpy(), self.unit_length, most_voxels)
-
-    def at(self, time: float) -> SurfaceMesh:
-        """The surfaces themselves: they do not move."""
-        return self
 
     def project(self, views: Views | Poses) -> LineIntegrals:
         """Line integrals (B, D), float64, differentiable in the vertices and in the numbers of `Poses`.

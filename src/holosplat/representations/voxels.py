@@ -18,7 +18,7 @@ from ..display import of_object
 from ..geometry import Grid, Poses, Views
 from ..matter import Matter
 from ..projectors.voxels import LatticeProjector, RayProjector, SliceProjector
-from ..volume import LineIntegrals, Volume
+from ..volume import LineIntegrals, Unmoved, Volume
 
 SAME = 0.9
 """Share of the pitch that pixels may have with voxels as on pixels of the pitch: views that are found to be magnified
@@ -160,7 +160,7 @@ MOST_PROJECTORS = 16
 """Projectors that a grid keeps ready, one for each batch of views: as many as a fit of single views has at most."""
 
 
-class VoxelGrid:
+class VoxelGrid(Unmoved):
     """Values on a grid: occupancies of known materials, or δ and β apart. Outside the grid there is nothing.
 
     values: [C, Z, Y, X] float32, of the channels of `matter`. Errors: `InputError` if the shapes do not fit.
@@ -215,10 +215,6 @@ class VoxelGrid:
     def enclosing_grid(self, most_voxels: int) -> Grid:
         """The grid itself, whatever its size."""
         return self.grid
-
-    def at(self, time: float) -> VoxelGrid:
-        """The grid itself: it does not move."""
-        return self
 
     def project(self, views: Views | Poses) -> LineIntegrals:
         """Line integrals (B, D), differentiable in the values and in unknown poses (see `VoxelLines`)."""

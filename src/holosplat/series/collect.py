@@ -114,9 +114,13 @@ def _identities(
         last = before.get(moment.number - 1)
         if last is not None and moment.number - 1 in names and task_of[moment.number - 1] != task:
             mine, count = same_bodies(rows[moment.number - 1].bodies, names[moment.number - 1], last.bodies, count)
-            agreement[task] = _mean_distance(
-                rows[moment.number - 1].bodies, names[moment.number - 1], last.bodies, mine
-            )
+            places = dict(zip(mine, (np.array(body[:3]) for body in last.bodies)))
+            found = [
+                float(np.linalg.norm(np.array(b[:3]) - places[n]))
+                for b, n in zip(rows[moment.number - 1].bodies, names[moment.number - 1])
+                if n in places
+            ]
+            agreement[task] = float(np.mean(found)) if found else float("nan")
             known = last.bodies, mine
         names[moment.number], count = same_bodies(*known, row.bodies, count)
         known = row.bodies, names[moment.number]
@@ -140,15 +144,6 @@ def same_bodies(
         if name < 0:
             given[j], count = count, count + 1
     return tuple(given), count
-
-
-def _mean_distance(
-    first: Sequence[Body], names: tuple[int, ...], second: Sequence[Body], others: tuple[int, ...]
-) -> float:
-    """Mean distance [m] between bodies of one name; NaN where there is none."""
-    places = dict(zip(others, (np.array(body[:3]) for body in second)))
-    found = [float(np.linalg.norm(np.array(b[:3]) - places[n])) for b, n in zip(first, names) if n in places]
-    return float(np.mean(found)) if found else float("nan")
 
 
 def collect(folder: SeriesFolder, fronts: bool = False) -> Collected:

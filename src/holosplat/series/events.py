@@ -43,8 +43,7 @@ class Parts:
         """
         factor = -(-max(grid.shape) // MOST_VOXELS)
         z, y, x = (-(-n // factor) for n in grid.shape)
-        centre = (o + 0.5 * (n - 1) * d for o, n, d in zip(grid.origin, grid.shape[::-1], grid.voxel_size))
-        coarse = Grid.centred((z, y, x), factor * grid.voxel_size[0], tuple(centre))  # type: ignore[arg-type]
+        coarse = Grid.centred((z, y, x), factor * grid.voxel_size[0], tuple(grid.centre))
         full = found.voxelise(coarse).delta / found.matter.delta > LEVEL
         around, beyond = _large(~full), np.zeros(0, dtype=int)
         for axis in range(3):

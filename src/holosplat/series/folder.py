@@ -13,8 +13,7 @@ from typing import Any, Literal
 
 from ..checks import as_written, require
 from ..io.atomic import atomic_folder, read_json, require_new, write_json
-from ..io.leftovers import is_hidden
-from ..io.lock import Writer, writer_of
+from ..io.lock import Writer, is_hidden, writer_of
 from ..tables import from_table
 from ..workflows.run_folder import SERIES
 from ..workflows.verdict import said_of_times

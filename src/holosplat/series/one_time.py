@@ -14,10 +14,13 @@ import torch
 
 from ..bodies.rest_shape import moments
 from ..checks import InputError
+from ..frames import block_means
 from ..geometry import Grid
 from ..inference import Compared, Decision, Score
 from ..io.atomic import atomic_path, read_json, write_json
+from ..io.formats import run_source
 from ..io.guard import read_array
+from ..io.reading import Reading
 from ..matter import MaterialPrior
 from ..methods import Method, Task
 from ..methods.continued import Continued
@@ -36,7 +39,7 @@ from ..workflows.reconstruction import Reconstruction
 from ..workflows.run_folder import RunFolder, claimed
 from .events import PARTS, Parts
 from .folder import Body, Row
-from .plan import Settings, prior_of
+from .plan import Settings, at, prior_of, times_of
 
 PHASE = "phase.npy"
 """The phase in the first view [rad], for pages."""
@@ -59,6 +62,13 @@ class Shot:
     prior: MaterialPrior
     source: dict[str, object]
     row: Row
+
+    @classmethod
+    def of(cls, scan: Scan, path: Path, prior: MaterialPrior, reading: Reading, row: Row) -> Shot:
+        """The time `row.frame` of the whole `scan` in the file `path`, read as `reading` says."""
+        frame = row.frame if len(times_of(scan)) > 1 else None
+        source = run_source(path, replace(reading, part=replace(reading.part, time_frame=frame)))
+        return cls(at(scan, row.frame), prior, source, row)
 
 
 @dataclass(frozen=True)
@@ -355,10 +365,7 @@ def write_phase(path: Path, found: Stored, scan: Scan) -> None:
     views = scan.views[[0]]
     with torch.no_grad():
         _, lines = found.project(views)
-        delta = lines[0].cpu().numpy()
-    factor = -(-max(views.shape) // MOST_PIXELS)
-    h, w = (n // factor * factor for n in views.shape)
-    binned = delta[:h, :w].reshape(h // factor, factor, w // factor, factor).mean((1, 3))
+    binned = block_means(lines[0].cpu().numpy(), -(-max(views.shape) // MOST_PIXELS))
     with atomic_path(path) as temporary:
         np.save(
             temporary, (-wavenumber(scan.exposures.reference_energy) * binned).astype(np.float16), allow_pickle=False

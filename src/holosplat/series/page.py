@@ -19,7 +19,7 @@ from ..checks import InputError, require, require_regular
 from ..io.atomic import atomic_path
 from ..io.guard import read_array
 from ..report.page import Headline, template
-from ..report.style import bar_length, format_length, in_print, scientific, superscript
+from ..report.style import bar_length, format_length, in_print, palette, scientific, superscript
 from ..units import in_percent, two_digits
 from ..units import plain as in_digits
 from ..workflows.next_step import next_step
@@ -76,7 +76,10 @@ def render_page(page: SeriesPage) -> str:
     kept, unread = _maps(shown)
     told = not any(frame.row.quantity == "β" for frame in shown)
     kept = kept if told else [(frame, -2 * phase) for frame, phase in kept]  # -k∫β, which stands for the phase then
-    low, high = _limits([phase for _, phase in kept])
+    values = [m[np.isfinite(m)] for m in ([phase for _, phase in kept])]
+    low = min((float(v.min()) for v in values if v.size), default=-1.0)
+    high = max((float(v.max()) for v in values if v.size), default=0.0)
+    low, high = (low, high) if high > low else (low - 1.0, low)
     ends = [f"{value + 0.0:.3g}{' rad' * told}".replace("-", "−") for value in (low, high)]  # −0 is 0
     pictures = [
         {
@@ -95,7 +98,7 @@ def render_page(page: SeriesPage) -> str:
         pictures=pictures,
         told=told,
         ends=ends if abs(high) > abs(low) else ends[::-1],
-        colours=[f"rgb{anchor}" for anchor in ANCHORS],
+        colours=[f"rgb{tuple(colour)}" for colour in palette()[::51].tolist()],
         bar=next(filter(None, (_scale_bar(frame) for frame, _ in reversed(kept))), None),
         charts=_charts(page.frames),
         rows=[_cells(frame) for frame in page.frames[-MOST_ROWS:]],
@@ -236,41 +239,14 @@ def _read(path: Path) -> np.ndarray:
     return found.astype(np.float32)
 
 
-def _limits(maps: Sequence[np.ndarray]) -> tuple[float, float]:
-    values = [m[np.isfinite(m)] for m in maps]
-    low = min((float(v.min()) for v in values if v.size), default=-1.0)
-    high = max((float(v.max()) for v in values if v.size), default=0.0)
-    return (low, high) if high > low else (low - 1.0, low)
-
-
 def _png(phase: np.ndarray, low: float, high: float) -> str:
     """A phase map as a `data:` URI, black where it is zero and bright where it is largest."""
     bright = (phase - low) / (high - low) if abs(high) > abs(low) else (high - phase) / (high - low)
     image = Image.fromarray(np.rint(255 * np.clip(np.nan_to_num(bright), 0, 1)).astype(np.uint8))
-    image.putpalette(_palette())
+    image.putpalette(palette().ravel().tolist())
     content = io.BytesIO()
     image.save(content, format="PNG", optimize=True)
     return f"data:image/png;base64,{base64.b64encode(content.getvalue()).decode()}"
-
-
-ANCHORS = (
-    (0, 0, 4),
-    (28, 16, 68),
-    (79, 18, 123),
-    (129, 37, 129),
-    (181, 54, 122),
-    (229, 80, 100),
-    (251, 135, 97),
-    (254, 194, 135),
-    (252, 253, 191),
-)
-"""Nine colours of matplotlib's map magma, evenly spaced; what lies between them is interpolated."""
-
-
-def _palette() -> list[int]:
-    at, given = np.linspace(0, 1, 256), np.linspace(0, 1, len(ANCHORS))
-    colours = [np.interp(at, given, [anchor[c] for anchor in ANCHORS]) for c in range(3)]
-    return np.rint(np.stack(colours, 1)).astype(int).ravel().tolist()
 
 
 WIDTH, HEIGHT = 460, 190

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..checks import InputError, as_written, require
 from ..io.formats import loader_of, read_frames
-from ..io.leftovers import is_hidden
+from ..io.lock import is_hidden
 from ..io.reading import Reading
 from ..matter import DeltaBeta, MaterialPrior, MatterKind
 from ..methods import Auto, Method

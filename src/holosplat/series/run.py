@@ -76,8 +76,7 @@ def write_script(folder: SeriesFolder, options: Slurm, retry: bool = False) -> t
 
     Errors: `InputError` where nothing is left.
     """
-    wanted = ("left", "failed") if retry else ("left",)
-    numbers = [state.number for state in states(folder) if state.state in wanted]
+    numbers = [state.number for state in remaining(states(folder), retry)]
     require(bool(numbers), f"{folder.path} has no task that is left; holosplat series status says how far it is.")
     text = script_of(folder, numbers, options, retry)
     folder.logs.mkdir(exist_ok=True)
@@ -127,8 +126,7 @@ def run_on_dask(
         raise MissingError(
             "--dask needs the package dask[distributed], which is not here; install it: pip install 'holosplat[dask]'."
         ) from None
-    wanted = ("left", "failed") if retry else ("left",)
-    numbers = [state.number for state in states(folder) if state.state in wanted]
+    numbers = [state.number for state in remaining(states(folder), retry)]
     try:
         client = Client(address, timeout=CONNECT_SECONDS)
     except (OSError, ValueError) as error:
@@ -186,6 +184,11 @@ def states(folder: SeriesFolder) -> list[TaskState]:
     return [folder.state(window) for window in folder.plan().windows()]
 
 
+def remaining(states: Sequence[TaskState], retry: bool) -> list[TaskState]:
+    """The tasks that are left, and, with `retry`, those that failed."""
+    return [state for state in states if state.state == "left" or (retry and state.state == "failed")]
+
+
 def run_left(
     folder: SeriesFolder,
     retry: bool = False,
@@ -208,9 +211,7 @@ def run_left(
         require(bool(found), f"tasks are counted from 0 to {len(every) - 1}, but none of these is asked for.")
         return found
 
-    for state in asked():
-        if state.state not in ("left", *(["failed"] if retry else [])):
-            continue
+    for state in remaining(asked(), retry):
         if not retry and (folder.task(state.number) / FAILED).is_file():  # since
             continue
         try:

@@ -281,7 +281,8 @@ class Stream(threading.Thread):
         self._ending.set()
         if self.ident is not None:
             self.join()
-        self._tell_all()
+        for kind, count in self._refused.items():
+            self._say(f"refused: {count} more like: {kind} …")
 
     def run(self) -> None:
         """See `threading.Thread.run`."""
@@ -374,10 +375,6 @@ class Stream(threading.Thread):
             self._told[kind] = now
             more = self._refused.pop(kind) - 1
             self._say(f"refused: {sentence}" + (f" ({more} more like it)" if more else ""))
-
-    def _tell_all(self) -> None:
-        for kind, count in self._refused.items():
-            self._say(f"refused: {count} more like: {kind} …")
 
 
 def _zmq() -> Any:

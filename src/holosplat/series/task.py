@@ -5,14 +5,15 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
 from ..bodies.rest_shape import moments
-from ..checks import InputError, is_of_memory, require
+from ..checks import InputError, is_of_memory, reason_of, require
 from ..io.atomic import read_json, write_json
 from ..io.formats import read_frames, run_source
 from ..io.lock import sole_writer
@@ -39,8 +40,9 @@ from .one_time import (
     retry_time,
     write_phase,
 )
-from .plan import Moment, SeriesPlan, Settings, Source, Window, at, fingerprint
+from .plan import Moment, SeriesPlan, Source, Window, fingerprint
 
+Result = TypeVar("Result")
 OnRow = Callable[[Row], None]
 """Called with every row that is written."""
 
@@ -67,7 +69,8 @@ def run_task(folder: SeriesFolder, number: int, on_row: OnRow = nothing) -> Task
             return folder.state(window)
         (path / FAILED).unlink(missing_ok=True)
         began = time.perf_counter()
-        reason = attempted(lambda: _work(folder, plan, window, on_row))
+        said, reason = attempted(_Work(folder, plan, window, on_row).run)
+        reason = reason or said
         if reason:
             write_json(path / FAILED, {"reason": reason})
         else:
@@ -75,151 +78,133 @@ def run_task(folder: SeriesFolder, number: int, on_row: OnRow = nothing) -> Task
     return folder.state(window)
 
 
-def _work(folder: SeriesFolder, plan: SeriesPlan, window: Window, on_row: OnRow) -> str:
-    """Do the times; why not all of them could be, or nothing."""
-    scans = Scans(plan)
-    if plan.settings.act == "track":
-        run = RunFolder(folder.task(window.number) / "run")
-        moment = window.moments[0]
-        source = plan.sources[moment.source]
-        rows = [_blank(m, source) for m in window.moments]
-        for row in track_window(scans.of(moment), source, plan, rows, run):
-            write_row(folder.row(window.number, row.number), row)
-            on_row(row)
-        return ""
-    failed, before = list[Row](), None
-    for number, moment in enumerate(window.moments):
-        path, run = folder.row(window.number, moment.number), RunFolder(folder.run(window.number, moment.number))
-        old = row = read_row(path) if path.is_file() else None
-        if row is None or not row.done:
-            if old is not None:  # it failed, and began as what is before it was then
-                shutil.rmtree(run.path, ignore_errors=True)
-            row = _row(plan, moment, scans, run, before)
-            if old is not None and row.done and plan.settings.warm.on:
-                _remove(folder, window.number, window.moments[number + 1 :])
-            write_row(path, row)
-            on_row(row)
-        if row.done:
-            before = Before(run, row)
-        else:
-            failed.append(row)
-    if not failed:
-        again = (_back, _conserved) if plan.settings.warm.on else ()
-        return "; ".join(filter(None, (each(folder, plan, window, scans, on_row) for each in again)))
-    return f"{len(failed)} of {len(window.moments)} times: {failed[0].reason}"
+@dataclass
+class _Work:
+    """The rest of a task. on_row: called with every row that is written."""
 
+    folder: SeriesFolder
+    plan: SeriesPlan
+    window: Window
+    on_row: OnRow
+    _open: tuple[int, Scan] | None = None
 
-def _back(folder: SeriesFolder, plan: SeriesPlan, window: Window, scans: Scans, on_row: OnRow) -> str:
-    """Go back over the finished times once, and try those again that are worse than the time after them (`is_worse`);
-    why not all of them could be, or nothing."""
-    failed, after = list[str](), list[tuple[Before, Scan]]()
-    for moment in reversed(window.moments):
-        path, shot = folder.row(window.number, moment.number), _shot(plan, moment, scans)
-        own = Before(RunFolder(folder.run(window.number, moment.number)), read_row(path))
-        found = list[Row]()
-        work = partial(_tried_again, shot, plan.settings, own, after, found)
-        failed += [reason] if (reason := attempted(work)) else []
-        for row in found:
-            write_row(path, row)
-            on_row(row)
-            own = replace(own, row=row)
-        after = [(own, shot.scan)]
-    return f"{len(failed)} times could not be tried again: {failed[0]}" if failed else ""
-
-
-def _conserved(folder: SeriesFolder, plan: SeriesPlan, window: Window, scans: Scans, on_row: OnRow) -> str:
-    """Try times of spherical matter again with the total δ that the others tell, where it may be conserved
-    (`common_totals`); why not all of them could be, or nothing."""
-    every = [
-        (moment, Before(RunFolder(folder.run(window.number, moment.number)), read_row(path)))
-        for moment in window.moments
-        if (path := folder.row(window.number, moment.number))
-    ]
-    if not all(is_spherical(own) for _, own in every):
-        return ""
-    noted, failed = folder.task(window.number) / CONSERVED, list[str]()
-    if not noted.is_file():
-        write_json(noted, {str(number): told for number, told in common_totals([own.row for _, own in every]).items()})
-    for number, told in read_json(noted).items():
-        moment, own = next(each for each in every if each[0].number == int(number))
-        if is_conserved(own):
-            continue
-
-        def work(moment: Moment = moment, own: Before = own, told: Told = tuple(told)) -> str:
-            row = retry_time(_shot(plan, moment, scans), plan.settings, own, own, told)
-            write_row(folder.row(window.number, moment.number), row)
-            on_row(row)
+    def run(self) -> str:
+        """Do the times; why not all of them could be, or nothing."""
+        if self.plan.settings.act == "track":
+            source, run = self._source(self.window.moments[0]), RunFolder(self.folder.task(self.window.number) / "run")
+            rows = [_blank(moment, source) for moment in self.window.moments]
+            for row in track_window(self._scan(self.window.moments[0]), source, self.plan, rows, run):
+                self._write(row)
             return ""
+        warm, failed, before = self.plan.settings.warm.on, list[Row](), None
+        for number, moment in enumerate(self.window.moments):
+            path, run = self._place(moment)
+            old = row = read_row(path) if path.is_file() else None
+            if row is None or not row.done:
+                if old is not None:  # it failed, and began as what is before it was then
+                    shutil.rmtree(run.path, ignore_errors=True)
+                done, reason = attempted(partial(self._reconstructed, moment, run, before))
+                row = done or replace(_blank(moment, self._source(moment)), reason=reason)
+                if old is not None and row.done and warm:  # those after it were done without it
+                    for later in self.window.moments[number + 1 :]:
+                        path, run_after = self._place(later)
+                        path.unlink(missing_ok=True)
+                        shutil.rmtree(run_after.path, ignore_errors=True)
+                self._write(row)
+            if row.done:
+                before = Before(run, row)
+            else:
+                failed.append(row)
+        if not failed:
+            again = (self._back, self._conserved) if warm else ()
+            return "; ".join(filter(None, (each() for each in again)))
+        return f"{len(failed)} of {len(self.window.moments)} times: {failed[0].reason}"
 
-        failed += [reason] if (reason := attempted(work)) else []
-    return f"{len(failed)} times could not be tried with the total of the others: {failed[0]}" if failed else ""
+    def _back(self) -> str:
+        """Go back over the finished times once, and try those again that are worse than the time after them
+        (`is_worse`); why not all of them could be, or nothing."""
+        failed, after = list[str](), None
+        for moment in reversed(self.window.moments):
+            own, shot = self._own(moment), self._shot(moment)
+            if after is not None:
+                row, reason = attempted(partial(self._tried_again, shot, own, *after))
+                failed += [reason] if reason else []
+                if row is not None:
+                    self._write(row)
+                    own = replace(own, row=row)
+            after = own, shot.scan
+        return f"{len(failed)} times could not be tried again: {failed[0]}" if failed else ""
 
+    def _conserved(self) -> str:
+        """Try times of spherical matter again with the total δ that the others tell, where it may be conserved
+        (`common_totals`); why not all of them could be, or nothing."""
+        every = {moment.number: (moment, self._own(moment)) for moment in self.window.moments}
+        if not all(is_spherical(own) for _, own in every.values()):
+            return ""
+        noted, failed = self.folder.task(self.window.number) / CONSERVED, list[str]()
+        if not noted.is_file():
+            totals = common_totals([own.row for _, own in every.values()])
+            write_json(noted, {str(number): told for number, told in totals.items()})
+        for number, told in read_json(noted).items():
+            moment, own = every[int(number)]
+            if is_conserved(own):
+                continue
+            row, reason = attempted(partial(self._with_total, moment, own, tuple(told)))
+            failed += [reason] if reason else []
+            if row is not None:
+                self._write(row)
+        return f"{len(failed)} times could not be tried with the total of the others: {failed[0]}" if failed else ""
 
-def _tried_again(
-    shot: Shot, settings: Settings, own: Before, after: Sequence[tuple[Before, Scan]], found: list[Row]
-) -> str:
-    """Add the new row of a time that is tried again from the one `after` it, of its scan, to those `found`."""
-    found += [retry_time(shot, settings, own, later) for later, scan in after if is_worse(shot, own, later, scan)]
-    return ""
+    def _reconstructed(self, moment: Moment, run: RunFolder, before: Before | None) -> Row:
+        return reconstruct_time(self._shot(moment), self.plan.settings, run, before)
 
+    def _tried_again(self, shot: Shot, own: Before, after: Before, later: Scan) -> Row | None:
+        return retry_time(shot, self.plan.settings, own, after) if is_worse(shot, own, after, later) else None
 
-def _remove(folder: SeriesFolder, task: int, moments: Sequence[Moment]) -> None:
-    """Remove times that were done without the one before them, which failed then: they are as if it never had."""
-    for moment in moments:
-        folder.row(task, moment.number).unlink(missing_ok=True)
-        shutil.rmtree(folder.run(task, moment.number), ignore_errors=True)
+    def _with_total(self, moment: Moment, own: Before, told: Told) -> Row:
+        return retry_time(self._shot(moment), self.plan.settings, own, own, told)
 
+    def _write(self, row: Row) -> None:
+        write_row(self.folder.row(self.window.number, row.number), row)
+        self.on_row(row)
 
-def _row(plan: SeriesPlan, moment: Moment, scans: Scans, run: RunFolder, before: Before | None) -> Row:
-    row = _blank(moment, plan.sources[moment.source])
+    def _place(self, moment: Moment) -> tuple[Path, RunFolder]:
+        """The file of a time's row, and the folder of its run."""
+        where = self.window.number, moment.number
+        return self.folder.row(*where), RunFolder(self.folder.run(*where))
 
-    def work() -> str:
-        nonlocal row
-        row = reconstruct_time(_shot(plan, moment, scans), plan.settings, run, before)
-        return ""
+    def _own(self, moment: Moment) -> Before:
+        path, run = self._place(moment)
+        return Before(run, read_row(path))
 
-    reason = attempted(work)
-    return replace(row, status="failed", reason=reason) if reason else row
+    def _source(self, moment: Moment) -> Source:
+        return self.plan.sources[moment.source]
 
+    def _shot(self, moment: Moment) -> Shot:
+        source = self._source(moment)
+        return Shot.of(self._scan(moment), source.path, source.prior, self.plan.reading, _blank(moment, source))
 
-def _shot(plan: SeriesPlan, moment: Moment, scans: Scans) -> Shot:
-    source = plan.sources[moment.source]
-    frame = moment.frame if len(source.times) > 1 else None
-    reading = replace(plan.reading, part=replace(plan.reading.part, time_frame=frame))
-    scan = at(scans.of(moment), moment.frame)
-    return Shot(scan, source.prior, run_source(source.path, reading), _blank(moment, source))
+    def _scan(self, moment: Moment) -> Scan:
+        """The whole scan of a time, whose frames are not read yet; one is kept open. Errors: `InputError` where it is
+        not what was planned with."""
+        if self._open is None or self._open[0] != moment.source:
+            self._open = moment.source, opened(self._source(moment), self.plan.reading)
+        return self._open[1]
 
 
 def _blank(moment: Moment, source: Source) -> Row:
     return Row(moment.number, str(source.path), moment.frame, moment.time, "failed")
 
 
-def attempted(work: Callable[[], str]) -> str:
-    """What `work` says, or why it failed: one fault must not take the others' results."""
+def attempted(work: Callable[[], Result]) -> tuple[Result | None, str]:
+    """What `work` gives, and "", or None and why it failed: one fault must not take the others' results."""
     try:
-        return work()
-    except InputError as error:
-        return str(error)
+        return work(), ""
     except Exception as error:
-        if is_of_memory(error):
-            return "the memory of this machine is not enough; take larger pixels (--bin), fewer rows or fewer jobs"
-        lines = str(error).strip().splitlines()
-        return ": ".join([type(error).__name__, *lines[-1:]])
-
-
-class Scans:
-    """The scans of a plan, each opened when it is first asked for, and held against the plan then; one is kept."""
-
-    def __init__(self, plan: SeriesPlan) -> None:
-        self._plan, self._kept = plan, dict[int, Scan]()
-
-    def of(self, moment: Moment) -> Scan:
-        """The whole scan of a time, whose frames are not read yet. Errors: `InputError` where it is not what it was."""
-        number = moment.source
-        if number not in self._kept:
-            source = self._plan.sources[number]
-            self._kept = {number: opened(source, self._plan.reading)}
-        return self._kept[number]
+        if is_of_memory(error) and not isinstance(error, InputError):
+            reason = "the memory of this machine is not enough; take larger pixels (--bin), fewer rows or fewer jobs"
+            return None, reason
+        return None, reason_of(error)
 
 
 def opened(source: Source, reading: Reading) -> Scan:

@@ -14,7 +14,7 @@ from typing import Any
 
 from ..checks import as_written, require
 from ..io.atomic import is_taken, read_json, require_parent, write_json, write_rows
-from ..io.formats import read_frames, run_source
+from ..io.formats import read_frames
 from ..io.lock import sole_writer
 from ..io.reading import Reading
 from ..matter import MaterialPrior
@@ -180,7 +180,13 @@ class Watch:
         self.folder.require_usable()
         with sole_writer(self.folder.path):
             self.folder.begin(dict(said))
-            self._take_up()
+            self._seen = self.folder.seen()
+            for seen in self._seen:
+                rows = [(run, row) for run, row in self.folder.rows(seen) if row.done]  # others are tried again
+                for run, row in rows:
+                    self._remember(run.path, row)
+                if len(rows) == seen.times:
+                    self._done.add(seen.key)
             running = f"Process {os.getpid()} on {socket.gethostname()} looks for scans."
             try:
                 if self.stream is not None:
@@ -191,16 +197,6 @@ class Watch:
                 if self.stream is not None:
                     self.stream.stop()
                 self._show("The watch has ended; the same command goes on.", 0.0)
-
-    def _take_up(self) -> None:
-        """What was done before."""
-        self._seen = self.folder.seen()
-        for seen in self._seen:
-            rows = [(run, row) for run, row in self.folder.rows(seen) if row.done]  # others are tried again
-            for run, row in rows:
-                self._remember(run.path, row)
-            if len(rows) == seen.times:
-                self._done.add(seen.key)
 
     def _remember(self, run: Path, row: Row) -> None:
         self._times.append((row, run))
@@ -245,16 +241,14 @@ class Watch:
 
     def _do(self, found: Found, running: str) -> bool:
         """Reconstruct a scan; False where it cannot be read (yet), which is said once."""
-        scans = list[Scan]()
 
-        def read() -> str:
+        def read() -> Scan:
             scan = read_frames(found.path, self.reading)
             at(scan, 0)  # the first frames can be read, and their values are numbers
-            scans.append(scan)
-            return ""
+            return scan
 
-        reason = attempted(read)
-        if reason:
+        scan, reason = attempted(read)
+        if scan is None:
             name = found.path.name
             if not any(key[0] == name and one.reason == reason for key, one in self._failures.items()):
                 self.say(f"cannot read {plain(found.path.name)} (it is tried again): {plain(reason)}")
@@ -262,11 +256,11 @@ class Watch:
             self._failures[found.key] = _Failure(reason, self.clock() + self.how.retry)
             return False
         self._forget(found.path.name)
-        seen = self._begun(found, scans[0])
+        seen = self._begun(found, scan)
         done = {row.frame for _, row in self.folder.rows(seen) if row.done}
         for frame in range(seen.times):
             if frame not in done:
-                self._time(found, scans[0], seen, frame, running)
+                self._time(found, scan, seen, frame, running)
                 self._stale = True
                 if self._is_due:
                     self._show(running, self.how.refresh)
@@ -291,22 +285,16 @@ class Watch:
         path, run, times = found.path, self.folder.run(seen.number, frame), times_of(scan)
         row = Row(seen.first + frame, str(path.resolve()), frame, times[frame], "failed")
 
-        def work() -> str:
-            nonlocal row
-            shown, part = at(scan, frame), self.reading.part
-            reading = replace(self.reading, part=replace(part, time_frame=frame if len(times) > 1 else None))
-            prior = self.prior(scan.exposures.reference_energy)
-            look = self._look(row, self.folder.scan(seen.number) / f"t{frame:04d}.{PHASE}", shown, running)
-            shot = Shot(shown, prior, run_source(path, reading), row)
-            row = reconstruct_time(shot, self.settings, run, self._before, quiet, look)
-            return ""
+        def work() -> Row:
+            shot = Shot.of(scan, path, self.prior(scan.exposures.reference_energy), self.reading, row)
+            look = self._look(row, self.folder.scan(seen.number) / f"t{frame:04d}.{PHASE}", shot.scan, running)
+            return reconstruct_time(shot, self.settings, run, self._before, quiet, look)
 
-        reason = attempted(work)
+        done, reason = attempted(work)
         if self._begun_time is not None:
             self._begun_time[1].unlink(missing_ok=True)
             self._begun_time = None
-        if reason:
-            row = replace(row, status="failed", reason=reason)
+        row = done or replace(row, reason=reason)
         write_row(self.folder.row(seen.number, frame), row)
         self._remember(run.path, row)
         name = plain(path.name) if len(times) == 1 else f"{plain(path.name)}, time {frame}"

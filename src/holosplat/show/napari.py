@@ -6,6 +6,7 @@ Axes are (z, y, x), with the time before them where matter moves; lengths are mi
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,8 @@ import numpy as np
 
 from ..checks import InputError
 from ..geometry import Grid
-from ..io.compact import FORMAT as COMPACT
 from ..io.hdf5 import open_hdf5
-from ..io.objects import FORMAT, read_object
+from ..io.objects import COMPACT, FORMAT, read_object
 from ..io.objects import GAUSSIANS_FORMAT as GAUSSIANS
 from ..io.volumes import NAMES, read_volume
 from ..mesh import joined
@@ -39,7 +39,10 @@ def get_reader(path: str | Sequence[str]) -> Callable[[str], list[Layer]] | None
         return None
     found = Path(path)
     if found.is_dir():
-        return layers if _is_run(found) else None
+        with suppress(InputError):
+            RunFolder(found).require_run()
+            return layers
+        return None
     if found.suffix.lower() not in (".h5", ".hdf5"):
         return None
     try:
@@ -51,11 +54,8 @@ def get_reader(path: str | Sequence[str]) -> Callable[[str], list[Layer]] | None
 
 
 def layers(path: str) -> list[Layer]:
-    """The layers of a path that `get_reader` takes: images of δ and β, or surfaces.
-
-    Gaussians, voxels and neural fields become images on a grid around them, moving ones at each time of their frames.
-    Errors: `InputError` for damaged files.
-    """
+    """The layers of a path that `get_reader` takes: surfaces, or images of δ and β on a grid, at each time of what
+    moves. Errors: `InputError` for damaged files."""
     found = Path(path)
     times: list[float] = []
     if found.is_dir():
@@ -76,14 +76,6 @@ def layers(path: str) -> list[Layer]:
         return [_surface(found.stem, surfaces, moving, about)]
     grid = obj.enclosing_grid(MOST_VOXELS // len(moments))
     return _images(found.stem, [moment.voxelise(grid) for moment in moments], about, moving)
-
-
-def _is_run(folder: Path) -> bool:
-    try:
-        RunFolder(folder).require_run()
-    except InputError:
-        return False
-    return True
 
 
 def _images(name: str, volumes: list[Volume], about: dict[str, Any], moving: bool = False) -> list[Layer]:

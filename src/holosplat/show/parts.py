@@ -4,18 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from ..checks import require
 from ..geometry import Grid
+from ..io.hdf5 import open_hdf5
+from ..io.objects import SERIES, read_object, read_series
 from ..io.solids import opacities
 from ..matter import Matter
 from ..mesh import TriangleMesh
 from ..representations import GaussianCloud, InMotion, Stored, SurfaceMesh, VoxelGrid, isosurface
 from ..units import bar_length, format_length
 from ..workflows.matter_map import MatterMap
+from ..workflows.reconstruction import instants_of
+from ..workflows.rehearsal import matter_of
+from ..workflows.run_folder import RunFolder
 
 HALF_EDGE = 10.0
 """Units of the scene from its middle to its farthest side, which suits the cameras of viewers."""
@@ -73,13 +80,16 @@ class Frame:
 
 
 def shown(obj: Stored) -> Shown:
-    """What is drawn of an object as it is: Gaussians, surfaces, or the surface at half of the largest |δ| of others.
-
-    Errors: `InputError` where there is no surface.
-    """
+    """What is drawn of an object: Gaussians, surfaces, or the surface at half of the largest |δ| of others;
+    `InputError` without one."""
     with torch.no_grad():
         if isinstance(obj, GaussianCloud):
-            return _splats(obj)
+            unit, turns = obj.unit_length, Rotation.from_quat(obj.quaternions.double().numpy()[:, [1, 2, 3, 0]])
+            axes = turns.as_matrix() * (unit * obj.scales.double().numpy())[:, None, :]
+            centres = unit * obj.centres.double().numpy()
+            depth = (centres[:, 2] - centres[:, 2].min()) / max(float(np.ptp(centres[:, 2])), 1e-30)
+            colours = np.array(NEAR) + depth[:, None] * (np.array(FAR) - np.array(NEAR))
+            return Splats(centres, axes @ axes.transpose(0, 2, 1), colours, opacities(obj, DEPTH))
         if isinstance(obj, SurfaceMesh):
             return obj.mesh()
         grid = obj.enclosing_grid(MOST_VOXELS)
@@ -88,8 +98,8 @@ def shown(obj: Stored) -> Shown:
 
 
 def at_times(obj: Stored, times: Sequence[float]) -> dict[str, Stored]:
-    """What the slider of time leads through, by its label: a moving object at up to `TIMES` of `times` [s], or from the
-    first of its basis to the last where there are none; any other object alone."""
+    """The objects of the time slider by label: a moving one at up to `TIMES` of `times` [s], or from the first time of
+    its basis to the last if there are none; any other object alone."""
     if not isinstance(obj, InMotion):
         return {"": obj}
     basis = obj.basis
@@ -111,6 +121,31 @@ def likely_surfaces(found: MatterMap) -> dict[str, Stored]:
         for level in SURE
         if level < most
     }
+
+
+def steps_of(folder: RunFolder) -> list[str]:
+    """How far the last fit of a run has come, in words; nothing where metrics.csv does not say."""
+    losses = folder.history().get("loss")
+    return [] if losses is None or len(losses) == 0 else [f"step {len(losses)}, loss {losses[-1]:.4g}"]
+
+
+def objects_of(what: Path) -> tuple[dict[str, Stored], list[str], str]:
+    """Objects by labels of the slider (times, or a rehearsed run and likely matter), words, the slider's name."""
+    require(what.exists(), f"{what} must be a run folder or an object file, but there is none; check the path.")
+    if what.is_dir():
+        folder = RunFolder(what)
+        folder.require_run()
+        obj, matter = folder.read_result(), matter_of(folder)
+        likely = {} if matter is None else likely_surfaces(matter)
+        words, slider = [obj.described, *steps_of(folder)], "shown" if likely else "time"
+        return at_times(obj, instants_of(folder)) | likely, words, slider
+    with open_hdf5(what) as file:
+        several = file.attrs.get("format", "") == SERIES
+    if several:
+        series = read_series(what)
+        return series, [f"{len(series)} objects"], "time"
+    obj = read_object(what)
+    return at_times(obj, ()), [obj.described], "time"
 
 
 def legend(part: Shown) -> tuple[str, str]:
@@ -138,13 +173,3 @@ def _beyond(places: np.ndarray, share: float) -> np.ndarray:
     """Which of `places` [N] stay; the farthest always does."""
     low, high = places.min(), places.max()
     return (places >= low + min(share, 1.0) * (high - low)) | (places == high)
-
-
-def _splats(cloud: GaussianCloud) -> Splats:
-    unit = cloud.unit_length
-    turns = Rotation.from_quat(cloud.quaternions.double().numpy()[:, [1, 2, 3, 0]]).as_matrix()
-    axes = turns * (unit * cloud.scales.double().numpy())[:, None, :]
-    centres = unit * cloud.centres.double().numpy()
-    depth = (centres[:, 2] - centres[:, 2].min()) / max(float(np.ptp(centres[:, 2])), 1e-30)
-    colours = np.array(NEAR) + depth[:, None] * (np.array(FAR) - np.array(NEAR))
-    return Splats(centres, axes @ axes.transpose(0, 2, 1), colours, opacities(cloud, DEPTH))

@@ -10,7 +10,7 @@ from ..checks import InputError
 from ..io.objects import read_object
 from ..representations import Stored
 from ..workflows.run_folder import RunFolder, fitted_by, read_status
-from .parts import Frame, Shown, at_times, cut, shown
+from .parts import Frame, Shown, at_times, cut, shown, steps_of
 from .server import LiveView
 
 CUTS = 50
@@ -20,10 +20,8 @@ BOX = 1000
 
 
 class Scene:
-    """The scene of a page: one of several objects, chosen by a slider and cut by another one.
-
-    The objects may be replaced while it is shown; sliders stay where they are.
-    """
+    """The scene of a page: one of several objects, chosen by a slider and cut by another one, which stay where they are
+    when the objects are replaced."""
 
     def __init__(self, page: LiveView) -> None:
         self._page = page
@@ -75,8 +73,7 @@ class Scene:
 
 
 class Follow:
-    """The folder is only read. It is looked at by `look`, and the object is drawn anew where its checkpoint is another
-    one and a browser is there. What cannot be read just now is read the next time."""
+    """A run that another process fits: each new checkpoint is drawn if a browser is there. The folder is only read."""
 
     def __init__(self, page: LiveView, folder: RunFolder) -> None:
         self._page, self._folder, self._scene = page, folder, Scene(page)
@@ -127,9 +124,3 @@ class Follow:
         except FileNotFoundError:
             return None
         return found.st_mtime_ns, found.st_size
-
-
-def steps_of(folder: RunFolder) -> list[str]:
-    """How far the last fit of a run has come, in words; nothing where metrics.csv does not say."""
-    losses = folder.history().get("loss")
-    return [] if losses is None or len(losses) == 0 else [f"step {len(losses)}, loss {losses[-1]:.4g}"]

@@ -295,7 +295,8 @@ class CarriedScene:
         count = int(np.ceil(2 * self.reach / self.step))
         depths = (np.arange(count) + 0.5) * (2 * self.reach / count) - self.reach
         for v, of_view in enumerate(channels.reshape(len(views), len(kinds), -1)):
-            x, y = _centres(views, v)
+            (h, w), (sx, sy), p = views.shape, views.shifts[v], float(views.pixel_sizes[v])
+            x, y = (np.arange(w) + 0.5 - w / 2) * p + sx, (np.arange(h) + 0.5 - h / 2) * p + sy
             flat = np.stack([one.ravel() for one in np.broadcast_arrays(x[None, :], y[:, None])])
             inside = np.flatnonzero((flat * flat).sum(0) < self.reach**2)
             for at in np.array_split(inside, max(1, len(inside) // RAYS)):
@@ -335,9 +336,3 @@ def _add(found: np.ndarray, element: Element, points: np.ndarray) -> None:
         share = element.profile.density(np.square(element.inverse @ near).sum(0)) * (1 + element.gradient @ near)
         found[0, within] += element.matter.delta * share
         found[1, within] += element.matter.beta * share
-
-
-def _centres(views: Views, view: int) -> tuple[np.ndarray, np.ndarray]:
-    """Columns' x [W] and rows' y [H] [m] of the pixels of a view, in its own frame."""
-    (h, w), (sx, sy), p = views.shape, views.shifts[view], float(views.pixel_sizes[view])
-    return (np.arange(w) + 0.5 - w / 2) * p + sx, (np.arange(h) + 0.5 - h / 2) * p + sy

@@ -160,7 +160,13 @@ class Collapse(SpecimenKind):
         gas = substances.medium.against(substances.material)
 
         def jet(share: float) -> tuple[TriangleMesh, TriangleMesh]:
-            bubble = self._bubble(share, way, centre)
+            radius, first = self.radius(share), 0.5 * self.bubble * self.size
+            vertices, faces = unit_ball(4)
+            turned = np.arccos(np.clip(vertices @ way, -1, 1))
+            depth = self.dent * (1 - (radius / first) ** 3)
+            shape = TriangleMesh(vertices * (1 - depth * np.exp(-((turned / 0.6) ** 2)))[:, None], faces, "bubble")
+            grown = radius * (4 / 3 * np.pi / shape.volume) ** (1 / 3)
+            bubble = shape.transformed(grown * np.eye(3), centre)
             return self._column(bubble.volume), bubble
 
         def scene(share: float) -> MeshScene:
@@ -176,15 +182,6 @@ class Collapse(SpecimenKind):
         found = bubble_radius(self.gas, self.mach, until)
         at = min(abs(share) * self.course * RAYLEIGH, float(found.t_max))
         return 0.5 * self.bubble * self.size * max(float(found(at)[0]), 1e-3)
-
-    def _bubble(self, share: float, way: np.ndarray, centre: np.ndarray) -> TriangleMesh:
-        radius, first = self.radius(share), 0.5 * self.bubble * self.size
-        vertices, faces = unit_ball(4)
-        turned = np.arccos(np.clip(vertices @ way, -1, 1))
-        depth = self.dent * (1 - (radius / first) ** 3)
-        shape = TriangleMesh(vertices * (1 - depth * np.exp(-((turned / 0.6) ** 2)))[:, None], faces, "bubble")
-        grown = radius * (4 / 3 * np.pi / shape.volume) ** (1 / 3)
-        return shape.transformed(grown * np.eye(3), centre)
 
     def _column(self, volume: float) -> TriangleMesh:
         a = 0.5 * self.size

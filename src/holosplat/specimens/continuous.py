@@ -14,12 +14,14 @@ from typing import Protocol
 
 import numpy as np
 import torch
+from scipy import special
 
 from ..checks import finite, in_range, require, shaped
+from ..frames import block_means
 from ..geometry import Grid, Views
 from ..matter import DeltaBeta
 from ..ranges import checked_dataclass
-from ..volume import LineIntegrals, Volume
+from ..volume import LineIntegrals, Unmoved, Volume
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(16)
 """Quadrature of a soft edge along a ray: 1e-9 of the line integral through the middle."""
@@ -108,24 +110,15 @@ class Bump:
 
     power: int = 3
     """Exponent, 1 to 20."""
+    reach, core = 1.0, 0.0
 
     def __post_init__(self) -> None:
         require(1 <= self.power <= 20, f"power of a bump must lie between 1 and 20, but it is {self.power}.")
 
     @property
-    def reach(self) -> float:
-        """1."""
-        return 1.0
-
-    @property
-    def core(self) -> float:
-        """None."""
-        return 0.0
-
-    @property
     def mass(self) -> float:
         """`2π B(3/2, power + 1)`."""
-        return 2 * math.pi * _beta(1.5, self.power + 1)
+        return 2 * math.pi * float(special.beta(1.5, self.power + 1))
 
     def density(self, s2: np.ndarray) -> np.ndarray:
         """The profile."""
@@ -133,7 +126,7 @@ class Bump:
 
     def chord(self, b2: np.ndarray) -> np.ndarray:
         """`B(1/2, power + 1) (1 - b²)^(power + 1/2)`."""
-        return _beta(0.5, self.power + 1) * np.maximum(1 - b2, 0) ** (self.power + 0.5)
+        return special.beta(0.5, self.power + 1) * np.maximum(1 - b2, 0) ** (self.power + 0.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +180,7 @@ class Element:
 
 
 @dataclass(frozen=True)
-class ContinuousScene:
+class ContinuousScene(Unmoved):
     """Elements that add up: a truth that `simulate` takes, without voxels; `InputError` if there are none."""
 
     elements: tuple[Element, ...]
@@ -216,10 +209,6 @@ class ContinuousScene:
         one = first.delta != 0 and max(crossed) <= 1e-9 * abs(first.delta) * max(map(abs, first))
         return (first,) if one else (DeltaBeta(1.0, 0.0), DeltaBeta(0.0, 1.0))
 
-    def at(self, time: float) -> ContinuousScene:
-        """The scene itself: it does not move."""
-        return self
-
     def missing_field(self, views: Views) -> float:
         """How far [m] the scene reaches beyond the detector in the worst view (0 or less: it fits)."""
         half = 0.5 * views.fields
@@ -239,9 +228,7 @@ class ContinuousScene:
         for v in range(len(views)):
             for element in self.elements:
                 _add_lines(channels[v], element, _shares(element.matter, kinds), fine[[v]])
-        h, w = views.shape
-        means = channels.reshape(len(views), len(kinds), h, RAYS, w, RAYS).mean((3, 5))
-        return LineIntegrals(torch.from_numpy(means), tuple((k.delta, k.beta) for k in kinds))
+        return LineIntegrals(torch.from_numpy(block_means(channels, RAYS)), tuple((k.delta, k.beta) for k in kinds))
 
     def voxelise(self, grid: Grid) -> Volume:
         """δ and β averaged over voxels, from `PER_VOXEL`³ points of each."""
@@ -283,18 +270,9 @@ def scaled(matter: DeltaBeta, factor: float) -> DeltaBeta:
 
 def random_rotation(rng: np.random.Generator) -> np.ndarray:
     """A rotation matrix [3, 3], all of them equally likely (Shoemake 1992, Graphics Gems III, 124)."""
-    w, x, y, z = (q := rng.normal(size=4)) / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    from scipy.spatial.transform import Rotation  # which takes long to load
 
-
-def _beta(a: float, b: float) -> float:
-    return math.exp(math.lgamma(a) + math.lgamma(b) - math.lgamma(a + b))
+    return Rotation.from_quat(np.roll(rng.normal(size=4), -1)).as_matrix()
 
 
 def _shares(matter: DeltaBeta, kinds: tuple[DeltaBeta, ...]) -> tuple[float, ...]:

@@ -158,6 +158,12 @@ def prism(outline: np.ndarray, depths: tuple[float, float], name: str = "prism")
     return TriangleMesh(np.concatenate([front, back]), np.concatenate([*sides, fan[:, ::-1], fan + count]), name)
 
 
+def _band(low: np.ndarray, high: np.ndarray) -> list[np.ndarray]:
+    """Triangles, two times [N, 3], between two rings of N vertices each."""
+    below, above = np.roll(low, -1), np.roll(high, -1)
+    return [np.column_stack([low, high, above]), np.column_stack([low, above, below])]
+
+
 def lathe(
     heights: np.ndarray, radii: np.ndarray, name: str = "lathe", path: np.ndarray | None = None, segments: int = 96
 ) -> TriangleMesh:
@@ -178,11 +184,7 @@ def lathe(
     after = (k + 1) % segments
     faces = []
     for n in range(len(heights) - 1):
-        low, high = segments * n, segments * (n + 1)
-        faces += [
-            np.column_stack([low + k, high + k, high + after]),
-            np.column_stack([low + k, high + after, low + after]),
-        ]
+        faces += _band(segments * n + k, segments * (n + 1) + k)
     top = segments * (len(heights) - 1)
     faces += [
         np.column_stack([np.full(segments, first), k, after]),
@@ -216,10 +218,6 @@ def rough_lens(
     for index, turned in ((above, 1), (below, -1)):
         sheet = [np.column_stack([np.zeros(sectors, dtype=int), 1 + k, 1 + after])]
         for n in range(rings - 1):
-            near, far = 1 + sectors * n, 1 + sectors * (n + 1)
-            sheet += [
-                np.column_stack([near + k, far + k, far + after]),
-                np.column_stack([near + k, far + after, near + after]),
-            ]
+            sheet += _band(1 + sectors * n + k, 1 + sectors * (n + 1) + k)
         faces.append(index[np.concatenate(sheet)][:, ::turned])
     return TriangleMesh(places, np.concatenate(faces), name)

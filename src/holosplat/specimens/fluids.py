@@ -35,21 +35,12 @@ class Blast:
     """Length behind the front after which compression ends, in units of the front's radius."""
     core_radius: Share = 0.0
     """Radius within which there is nothing, in units of the front's radius."""
+    reach, core = 1.0, 0.0
 
     def __post_init__(self) -> None:
         require(
             self.core_radius < 1, f"core_radius must be below 1, the front's radius, but it is {self.core_radius:g}."
         )
-
-    @property
-    def reach(self) -> float:
-        """1."""
-        return 1.0
-
-    @property
-    def core(self) -> float:
-        """None."""
-        return 0.0
 
     @property
     def mass(self) -> float:

@@ -10,7 +10,7 @@ from scipy.special import ndtr, ndtri
 
 from ..checks import InputError, finite, in_range, require, shaped
 from ..mesh import TriangleMesh
-from .red_cells import icosphere
+from .red_cells import icosphere, whole_number
 
 BATCHES = (16, 128, 1024) + (2048,) * 50
 """A ball's place is looked for among so many random points at a time: few as long as there is room."""
@@ -98,8 +98,7 @@ def star_of_balls(diameters: np.ndarray, seed: int | np.random.Generator = 0, sp
     The balls come size by size in the order of `diameters`. `InputError` where two neighbouring sizes would touch.
     """
     diameters = _checked_diameters(diameters)
-    whole = isinstance(spokes, (int, np.integer)) and spokes >= 3
-    require(whole, f"spokes must be a whole number of at least 3, but it is {spokes!r}.")
+    whole_number("spokes", spokes, least=3)
     ring = diameters / np.sin(np.pi / spokes)
     order = np.sort(diameters)
     apart = np.sqrt(2) * np.diff(np.sort(ring)) - 0.5 * (order[1:] + order[:-1])
@@ -197,8 +196,7 @@ def place_capsules(
     longest by up to this fraction, from 0 (balls) to 0.5. Each keeps to a ball of its own. `InputError` when they do
     not fit.
     """
-    whole = isinstance(count, (int, np.integer)) and count >= 1
-    require(whole, f"the number of capsules must be a whole number of at least 1, but it is {count!r}.")
+    whole_number("the number of capsules", count)
     small, large = (in_range("capsule diameter", d, 1e-9, 1.0, unit="metres") for d in diameters)
     require(
         small <= large, f"diameters must be the smallest and the largest, but they are {diameters!r}; exchange them."
@@ -241,8 +239,7 @@ def random_foam(
     median: of the bubbles' diameters [m]; spread: standard deviation of their natural logarithm (drawn within two
     of them); margin: thinnest film of liquid [m], by default 5 % of the median. `InputError` when they do not fit.
     """
-    whole = isinstance(count, (int, np.integer)) and count >= 1
-    require(whole, f"the number of bubbles must be a whole number of at least 1, but it is {count!r}.")
+    whole_number("the number of bubbles", count)
     in_range("median diameter", median, 1e-9, 1.0, unit="metres")
     require(0 <= spread <= 1, f"spread must lie between 0 and 1, but it is {spread!r}.")
     rng = np.random.default_rng(seed)

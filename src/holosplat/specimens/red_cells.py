@@ -365,11 +365,16 @@ def _random_rotation(rng: np.random.Generator) -> np.ndarray:
     return Rotation.from_quat(rng.standard_normal(4)).as_matrix()
 
 
+def whole_number(name: str, value: int, least: int = 1) -> None:
+    """`InputError` naming what is no whole number, or below the `least`."""
+    whole = isinstance(value, (int, np.integer)) and value >= least
+    require(whole, f"{name} must be a whole number of at least {least}, but it is {value!r}.")
+
+
 def _check_channel(
     count: int, box: tuple[float, float, float], diameter: float, deform: float, margin: float, shape: str
 ) -> None:
-    whole = isinstance(count, (int, np.integer)) and count >= 1
-    require(whole, f"the number of red cells must be a whole number of at least 1, but it is {count!r}.")
+    whole_number("the number of red cells", count)
     require(len(box) == 3, f"box must be three extents (x, y, z) in metres, but it is {box!r}.")
     for axis, extent in zip("xyz", box):
         in_range(f"box extent {axis}", extent, 1e-9, 10.0, unit="metres")

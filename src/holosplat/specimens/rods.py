@@ -12,9 +12,10 @@ import numpy as np
 import torch
 
 from ..checks import finite, in_range, require, shaped
+from ..frames import block_means
 from ..geometry import Grid, Views
 from ..matter import DeltaBeta
-from ..volume import LineIntegrals, Volume
+from ..volume import LineIntegrals, Unmoved, Volume
 from .continuous import PER_VOXEL, RAYS
 from .phantoms import Ball, packed_balls
 
@@ -51,7 +52,7 @@ class Rod:
 
 
 @dataclass(frozen=True, eq=False)
-class RodScene:
+class RodScene(Unmoved):
     """The union of `rods`, filled with `matter` against its medium: what overlaps counts once.
 
     Errors: `InputError` if there are none.
@@ -85,10 +86,6 @@ class RodScene:
         ends, radii = self.ends, self.radii[:, None, None]
         return (ends - radii).min(axis=(0, 1)), (ends + radii).max(axis=(0, 1))
 
-    def at(self, time: float) -> RodScene:
-        """The scene itself: it does not move."""
-        return self
-
     def missing_field(self, views: Views) -> float:
         """How far [m] a rod reaches beyond the detector in the worst view (0 or less: all are seen whole)."""
         seen = np.einsum("vij,nej->vnei", views.rotations, self.ends)[..., :2] - views.shifts[:, None, None]
@@ -115,15 +112,13 @@ class RodScene:
                     if near.any():
                         found = [_interval(e, r, x, y[:, None]) for e, r in zip(ends[near], self.radii[near])]
                         lines[v, top : top + TILE, left : left + TILE] = _covered(*map(np.stack, zip(*found)))
-        (h, w) = views.shape
-        means = lines.reshape(len(views), 1, h, RAYS, w, RAYS).mean(axis=(3, 5))
-        return LineIntegrals(torch.from_numpy(means), (tuple(self.matter),))  # type: ignore[arg-type]
+        means = torch.from_numpy(block_means(lines, RAYS)[:, None])
+        return LineIntegrals(means, (tuple(self.matter),))  # type: ignore[arg-type]
 
     def voxelise(self, grid: Grid) -> Volume:
         """δ and β against the medium, averaged over voxels, from `PER_VOXEL`³ points of each."""
         share, (nz, ny, nx) = np.zeros(grid.shape), grid.shape
-        inside = (np.arange(PER_VOXEL) + 0.5) / PER_VOXEL - 0.5
-        x, y, z = ((at[:, None] + d * inside).ravel() for at, d in zip(grid.axes(), grid.voxel_size))
+        x, y, z = grid.divided((PER_VOXEL, PER_VOXEL, PER_VOXEL)).axes()
         cells = (1, PER_VOXEL, ny, PER_VOXEL, nx, PER_VOXEL)
         for k in range(nz):
             layer = z[k * PER_VOXEL : (k + 1) * PER_VOXEL]

@@ -16,11 +16,11 @@ from ..matter import DeltaBeta
 from ..mesh import TriangleMesh, joined
 from ..projectors.mesh import mesh_line_integrals, voxelise_meshes
 from ..projectors.voxels.raycast import voxel_line_integrals
-from ..volume import LineIntegrals, Volume
+from ..volume import LineIntegrals, Unmoved, Volume
 
 
 @dataclass(frozen=True)
-class MeshScene:
+class MeshScene(Unmoved):
     """A scene of closed meshes, each filled with one material.
 
     meshes: with outward normals (see `specimens.repair.closed`); coordinates `(x, y, z)` [m].
@@ -70,10 +70,6 @@ class MeshScene:
         """The scene for another backend (resolved)."""
         return replace(self, backend=backend)
 
-    def at(self, time: float) -> MeshScene:
-        """The scene itself: it does not move."""
-        return self
-
     def project(self, views: Views) -> LineIntegrals:
         """Line integrals of each material, or of δ and β where there are more than two; float64, 2 × 2 rays a pixel."""
         vertices, faces, values, kinds = self._soup()
@@ -114,7 +110,7 @@ MOST_POINTS = 1 << 22
 
 
 @dataclass(frozen=True, eq=False)
-class VoxelScene:
+class VoxelScene(Unmoved):
     """The truth that a volume describes: its values stand at the centres of voxels, and are interpolated in between.
 
     No fit projects so: fits use slice matrices and the lattice of voxels. `InputError` for a volume without matter.
@@ -136,10 +132,6 @@ class VoxelScene:
             low.append(at[there[0]] - 0.5 * size)
             high.append(at[there[-1]] + 0.5 * size)
         return np.array(low), np.array(high)
-
-    def at(self, time: float) -> VoxelScene:
-        """The scene itself: it does not move."""
-        return self
 
     def missing_field(self, views: Views) -> float:
         """How far [m] the filled box reaches beyond the detector in the worst view (0 or less: it fits)."""
@@ -172,14 +164,9 @@ class VoxelScene:
         """δ and β averaged over the voxels of `grid`: the mean of two points or more a voxel of the volume and edge."""
         own = self.volume.grid
         n = max(2, *(2 * int(np.ceil(d / o)) for d, o in zip(grid.voxel_size, own.voxel_size)))
-        inside = (np.arange(n) + 0.5) / n - 0.5
         values = torch.from_numpy(np.stack([self.volume.delta, self.volume.beta]))[None]
-        x, y, z = (
-            2 * ((at[:, None] + d * inside).reshape(-1) - centre) / (size * count)
-            for at, d, centre, size, count in zip(
-                grid.axes(), grid.voxel_size, own.centre, own.voxel_size, own.shape[::-1]
-            )
-        )
+        fine = zip(grid.divided((n, n, n)).axes(), own.centre, own.voxel_size, own.shape[::-1])
+        x, y, z = (2 * (at - centre) / (size * count) for at, centre, size, count in fine)
         out = np.zeros((2, *grid.shape), np.float32)
         step = max(1, MOST_POINTS // (n * len(x) * len(y)))
         for start in range(0, grid.shape[0], step):

@@ -232,8 +232,4 @@ class AlignedValidation(Validation):
         with torch.no_grad():
             voxels = lesson.field(dict(network.named_parameters()), self.size).at(0.0)
             misfit = float(lesson.misfit(voxels))
-        return misfit, _overlap(voxels, sample), misfit
-
-
-def _overlap(voxels: VoxelGrid, sample: Sample) -> float:
-    return share_of_overlap(voxels.values[0].cpu() > 0.5, torch.from_numpy(sample.occupancy) > 127)
+        return misfit, share_of_overlap(voxels.values[0].cpu() > 0.5, torch.from_numpy(sample.occupancy) > 127), misfit

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -16,8 +16,10 @@ from torch import Tensor, nn
 
 from ..beamline.grow import SeriesFolder, read_compact
 from ..checks import as_written, require
-from ..io.atomic import read_json, write_rows
+from ..io.atomic import read_json
 from ..learning.start import Card
+from ..mesh import ball_radius
+from ..motion.elastic import vertex_normals
 from ..motion.learned import (
     DEGREE,
     LONGEST,
@@ -28,10 +30,9 @@ from ..motion.learned import (
     ahead_of,
     base,
     spread_of,
-    vertex_normals,
     write_dynamics,
 )
-from .shown import FILE
+from .shown import Judge
 from .train import WEIGHTS, Training
 
 SIZE = DynamicsSize()
@@ -66,8 +67,7 @@ class Series:
     def radius(self) -> float:
         """Of a ball of a cell's volume [m]."""
         a, b, c = self.nodes[0, 0][self.faces].unbind(-2)
-        volume = float((a * torch.linalg.cross(b, c)).sum() / 6)
-        return (3 * volume / (4 * np.pi)) ** (1 / 3)
+        return ball_radius(float((a * torch.linalg.cross(b, c)).sum() / 6))
 
     def on(self, device: str) -> Series:
         """The same on a device."""
@@ -243,14 +243,13 @@ def draw_lesson(series: Series, rng: np.random.Generator) -> Lesson:
 
 
 @dataclass
-class DynamicsValidation:
+class DynamicsValidation(Judge):
     """Series that were not trained on, and errors there [radii], across surfaces: rows of step, noise, snapshots ahead,
     error of the network, error that it states, and of a quadratic through the last third of the window."""
 
     columns: ClassVar[tuple[str, ...]] = ("step", "noise", "ahead", "missed", "thought", "quadratic")
 
-    samples: list[Series]
-    rows: list[tuple[float, ...]] = field(default_factory=list)
+    samples: Sequence[Series]
 
     def judge(self, network: nn.Module, step: int) -> None:
         """A row for each noise and time ahead."""
@@ -264,10 +263,6 @@ class DynamicsValidation:
         """The newest rows in words."""
         said = self.rows[-len(ASKED) * len(NOISES) :]
         return ", ".join(f"{ahead} ahead at noise {noise:g}: {missed:.4f}" for _, noise, ahead, missed, *_ in said)
-
-    def write(self, folder: Path) -> None:
-        """Write all rows, whole or not at all."""
-        write_rows(folder / FILE, self.columns, ([f"{value:.6g}" for value in row] for row in self.rows))
 
     def card(self, network: nn.Module, trained_on: dict[str, Any], made_by: dict[str, str]) -> Card:
         """What `network` scores here, and what its standard errors are to be multiplied by."""

@@ -244,13 +244,6 @@ class Scenes(TorchDataset[Any]):
         require(1 <= count <= ENDLESS, f"count must lie between 1 and {ENDLESS}, but it is {count}; correct it.")
         self.ranges, self.seed, self.count, self.shown = ranges, seed, count, shown
 
-    @classmethod
-    def of_folder(cls, folder: Path, shown: Callable[[Sample], Any] | None = None) -> Scenes:
-        """Those of a folder of `holosplat dataset`, from its files; `InputError` where it is none, or not whole."""
-        dataset = Dataset.read(folder)
-        dataset.require_whole()
-        return _Kept(dataset, shown)
-
     def __len__(self) -> int:
         return self.count
 
@@ -258,22 +251,8 @@ class Scenes(TorchDataset[Any]):
         number = int(index) + self.count * (index < 0)
         if not 0 <= number < self.count:
             raise IndexError(f"scenes are numbered from 0 to {self.count - 1}, but {index} is asked for")
-        sample = self._sample(number)
+        sample = sample_of(self.ranges, self.seed, number)
         return tensors_of(sample) if self.shown is None else self.shown(sample)
-
-    def _sample(self, number: int) -> Sample:
-        return sample_of(self.ranges, self.seed, number)
-
-
-class _Kept(Scenes):
-    """The same, read from files."""
-
-    def __init__(self, dataset: Dataset, shown: Callable[[Sample], Any] | None) -> None:
-        super().__init__(dataset.ranges, dataset.seed, dataset.count, shown)
-        self._dataset = dataset
-
-    def _sample(self, number: int) -> Sample:
-        return self._dataset.sample(number)
 
 
 def tensors_of(sample: Sample) -> Tensors:

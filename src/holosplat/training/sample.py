@@ -134,19 +134,14 @@ def _directions(rng: np.random.Generator, ranges: Ranges, tilted: bool) -> tuple
         angles = first + np.arange(count) * (180 / count)
         rng.shuffle(angles)
     else:
-        angles = _draw_separated_angles(rng, first, count)
+        least = 180 / count * LEAST_GAP
+        gaps = least + (180 - count * least) * rng.dirichlet(np.ones(count))
+        angles = first + np.concatenate([[0.0], np.cumsum(gaps)[:-1]])
+        rng.shuffle(angles[1:])
+        angles = angles
         angles[1] = first + rng.uniform(80, 100)
     tilts = rng.uniform(-ranges.tilt, ranges.tilt, count) if tilted else np.zeros(count)
     return tuple((float(angle % 180), float(tilt)) for angle, tilt in zip(angles, tilts))
-
-
-def _draw_separated_angles(rng: np.random.Generator, first: float, count: int) -> np.ndarray:
-    """Draw angles [count] [degrees] about an axis, with a least distance."""
-    least = 180 / count * LEAST_GAP
-    gaps = least + (180 - count * least) * rng.dirichlet(np.ones(count))
-    angles = first + np.concatenate([[0.0], np.cumsum(gaps)[:-1]])
-    rng.shuffle(angles[1:])
-    return angles
 
 
 def _log(rng: np.random.Generator, pair: tuple[float, float]) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -120,19 +121,40 @@ OTHER_SEED = 1
 MOST = 95
 """Per cent of the scenes that leave less unexplained than what counts as typical."""
 FILE = "validation.csv"
-COLUMNS = ("step", "views", "dice_guess", "dice")
+
+
+def write_numbers(path: Path, columns: Sequence[str], rows: Sequence[Sequence[float]]) -> None:
+    """Write a table of numbers, whole or not at all."""
+    write_rows(path, columns, ([f"{value:.6g}" for value in row] for row in rows))
 
 
 @dataclass
-class Validation:
+class Judge(ABC):
+    """Data that networks were not trained on, and what they scored there: rows of the step and other numbers."""
+
+    columns: ClassVar[tuple[str, ...]]
+    """Of the file."""
+
+    samples: Sequence[Any]
+    rows: list[tuple[float, ...]] = field(default_factory=list)
+
+    @abstractmethod
+    def judge(self, network: nn.Module, step: int) -> None:
+        """Rows of scores after `step` steps."""
+
+    def write(self, folder: Path) -> None:
+        """Write all rows, whole or not at all."""
+        write_numbers(folder / FILE, self.columns, self.rows)
+
+
+@dataclass
+class Validation(Judge):
     """Scenes of another seed, and what networks scored on them: rows of step, number of views, Dice of the guess and of
     the corrected one."""
 
-    columns: ClassVar[tuple[str, ...]] = COLUMNS
-    """Of the file."""
+    columns: ClassVar[tuple[str, ...]] = ("step", "views", "dice_guess", "dice")
 
     samples: Sequence[Sample]
-    rows: list[tuple[float, ...]] = field(default_factory=list)
 
     @classmethod
     def of(cls, ranges: Ranges, seed: int, count: int, on_progress: Callable[[float], None]) -> Validation:
@@ -153,10 +175,6 @@ class Validation:
         """The newest rows in words."""
         counts = len(self._counts())
         return ", ".join(f"{int(views)} views {best:.3f}" for _, views, _, best in self.rows[-counts:])
-
-    def write(self, folder: Path) -> None:
-        """Write all rows, whole or not at all."""
-        write_rows(folder / FILE, self.columns, ([f"{value:.6g}" for value in row] for row in self.rows))
 
     def card(self, network: nn.Module, trained_on: dict[str, Any], made_by: dict[str, str]) -> Card:
         """What `network` scores here, as a card."""

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from torch.nn.utils import clip_grad_norm_
 
 from ..backends import require_device
 from ..checks import InputError, as_written, require
-from ..io.atomic import read_json, write_json, write_rows, write_state
+from ..io.atomic import read_json, write_json, write_state
 from ..learning.network import Guess
 from ..learning.start import Card, write_weights
 from ..tables import to_table
@@ -27,7 +27,7 @@ from ..workflows.run_folder import checkpoint_state
 from .folder import Dataset
 from .options import Ranges, TrainOptions
 from .sample import Sample
-from .shown import Validation, draw_example, loss
+from .shown import Judge, Validation, draw_example, loss, write_numbers
 
 PURPOSE = 2102
 """Keeps the numbers that are drawn here apart from others of the same seed."""
@@ -42,18 +42,6 @@ def has_bfloat16() -> bool:
     """Whether the processor multiplies bfloat16 (AVX-512 BF16 or AMX), as far as torch says it."""
     found = getattr(torch.cpu, "get_capabilities", dict)()
     return bool(found.get("avx512_bf16") or found.get("amx_bf16"))
-
-
-class Judge(Protocol):
-    """What scores a network on data that it was not trained on."""
-
-    def judge(self, network: torch.nn.Module, step: int) -> None:
-        """Rows of scores after `step` steps."""
-        ...
-
-    def write(self, folder: Path) -> None:
-        """Write all rows."""
-        ...
 
 
 class Training:
@@ -165,7 +153,7 @@ class Training:
         """Write the checkpoint, the curves and the validation, each whole or not at all."""
         state: dict[str, Any] = {name: part.state_dict() for name, part in self.parts().items()}
         write_state(self.folder / CHECKPOINT, state | {"step": self.step, "rows": [list(row) for row in self.rows]})
-        write_rows(self.folder / CURVES, self.columns, ([f"{value:.6g}" for value in row] for row in self.rows))
+        write_numbers(self.folder / CURVES, self.columns, self.rows)
         validation.write(self.folder)
 
     def finish(self, validation: Validation, made_by: dict[str, str]) -> Path:

@@ -63,28 +63,6 @@ def factors() -> Mapping[str, Factor]:
     return {name: Factor(**entry) for name, entry in read_table(FACTORS).items()}
 
 
-def conformal_quantile(scores: np.ndarray, level: float) -> float:
-    """The ⌈(n + 1) level⌉-th smallest of n scores, which the next one exceeds with a probability of at most 1 - level
-    (Vovk et al. 2005; Lei et al. 2018, section 2.2); infinite for too few."""
-    rank = math.ceil((len(scores) + 1) * level)
-    return float(np.sort(scores)[rank - 1]) if rank <= len(scores) else math.inf
-
-
-def fitted_factor(errors: np.ndarray, scales: np.ndarray) -> tuple[float, float]:
-    """The floor and the factor of a quantity by its errors [N] and its scales [N] in N scenes.
-
-    Each floor, of the scales that there are, makes intervals that cover `LEVEL` of the scenes: that of the least mean
-    logarithm of the length is taken (efficiency; Vovk et al. 2016, COPA). Of so few scenes that there is no quantile,
-    the factor is the largest score; then the level is n/(n + 1).
-    """
-    sizes, found = np.abs(errors), list[tuple[float, float, float]]()
-    for floor in np.unique(scales[scales > 0]):
-        scores = sizes / (scales + floor)
-        factor = min(conformal_quantile(scores, LEVEL), float(scores.max()))
-        found.append((float(np.log(factor * (scales + floor)).mean()), float(floor), factor))
-    return min(found)[1:]
-
-
 SIGNED, SIZES = ("total", "delta", "volume"), ("centre", "dice", "error", "resolution")
 """Quantities with errors of either sign, as shares; and sizes of errors: of the centre of mass [pixels], 1 - Dice, the
 relative error of δ, and the logarithm of the resolution over two pixels."""
@@ -129,10 +107,10 @@ def errors_of(found: Reconstruction, truth: Volume) -> dict[str, float]:
 
 def _centre(delta: np.ndarray) -> np.ndarray:
     """The centre of mass [voxels]; the middle of an empty volume."""
+    from scipy.ndimage import center_of_mass  # which takes long to load
+
     weight = np.abs(delta).astype(np.float64)
-    weight = weight if weight.any() else np.ones_like(weight)
-    axes = [weight.sum(axis=tuple(b for b in range(3) if b != a)) for a in range(3)]
-    return np.array([float(np.average(np.arange(len(w)), weights=w)) for w in axes])
+    return np.array(center_of_mass(weight if weight.any() else np.ones_like(weight)))
 
 
 @dataclass(frozen=True)

@@ -121,8 +121,11 @@ def _as_they_are(parts: list[Exposures]) -> tuple[Exposures, list[Resampling | N
     return _exposures(parts, shapes[0], sizes, blurs), [None] * len(parts)
 
 
-def _common_shape(parts: list[Exposures], pitch: float) -> tuple[int, int]:
-    """Rows and columns of the largest field, about their centres, that all detectors have."""
+def _on_one_raster(parts: list[Exposures], pixel_size: float | None) -> tuple[Exposures, list[Resampling | None]]:
+    """The exposures of all frames on the common raster, and what brings each part's frames there."""
+    if pixel_size is not None:
+        in_range("--pixel-size", pixel_size, *PIXEL_RANGE_M, unit="metres")
+    pitch = max(part.views.pixel_size for part in parts) if pixel_size is None else pixel_size
     rows, columns = (
         math.floor(min(part.views.shape[axis] * part.views.pixel_size for part in parts) / pitch * (1 + 1e-9))
         for axis in range(2)
@@ -132,15 +135,7 @@ def _common_shape(parts: list[Exposures], pitch: float) -> tuple[int, int]:
         f"the field that all detectors have would be {rows} × {columns} pixels of {pitch:g} m; take a smaller "
         "--pixel-size.",
     )
-    return rows, columns
-
-
-def _on_one_raster(parts: list[Exposures], pixel_size: float | None) -> tuple[Exposures, list[Resampling | None]]:
-    """The exposures of all frames on the common raster, and what brings each part's frames there."""
-    if pixel_size is not None:
-        in_range("--pixel-size", pixel_size, *PIXEL_RANGE_M, unit="metres")
-    pitch = max(part.views.pixel_size for part in parts) if pixel_size is None else pixel_size
-    shape = _common_shape(parts, pitch)
+    shape = rows, columns
     resamplings, blurs = list[Resampling | None](), []
     for part in parts:
         own = part.views.pixel_size

@@ -50,28 +50,25 @@ def is_complete(folder: RunFolder, config: dict[str, Any]) -> bool:
 def require_same(folder: RunFolder, config: dict[str, Any]) -> None:
     """`InputError` unless the run in `folder` was started with this `config`; another machine may go on with it."""
     with as_written(folder.config, "of a run that has begun"):
-        _require_same(folder, folder.read_config(), json.loads(json.dumps(config)))
-
-
-def _require_same(folder: RunFolder, old: dict[str, Any], same: dict[str, Any]) -> None:
-    for name, default in (("light", LightOptions()), ("uncertain", Uncertain())):
-        known = json.loads(json.dumps(to_table(default)))
-        old[name] = known | old.get(name, {})  # what older versions did not know
-    old.setdefault("refine", None)
-    version = old.get("schema_version", 1)
-    require(
-        version == SCHEMA,
-        f"{folder.path} was begun by a version of holosplat whose checkpoints differ (schema {version}, now "
-        f"{SCHEMA}); start anew into another --out, with --config {folder.config}.",
-    )
-    for table in (old, same):
-        _without_backends(table.get("method", {}))
-        table.get("prior", {}).pop("medium", None)  # a name, which older versions did not keep
-    for key, name in RESUMED_WITH.items():
+        old, same = folder.read_config(), json.loads(json.dumps(config))
+        for name, default in (("light", LightOptions()), ("uncertain", Uncertain())):
+            known = json.loads(json.dumps(to_table(default)))
+            old[name] = known | old.get(name, {})  # what older versions did not know
+        old.setdefault("refine", None)
+        version = old.get("schema_version", 1)
         require(
-            key not in same or old.get(key) == same[key],
-            f"--resume needs the {name} that {folder.path} was started with; use the same, or another --out.",
+            version == SCHEMA,
+            f"{folder.path} was begun by a version of holosplat whose checkpoints differ (schema {version}, now "
+            f"{SCHEMA}); start anew into another --out, with --config {folder.config}.",
         )
+        for table in (old, same):
+            _without_backends(table.get("method", {}))
+            table.get("prior", {}).pop("medium", None)  # a name, which older versions did not keep
+        for key, name in RESUMED_WITH.items():
+            require(
+                key not in same or old.get(key) == same[key],
+                f"--resume needs the {name} that {folder.path} was started with; use the same, or another --out.",
+            )
 
 
 def _without_backends(table: Any) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..checks import InputError, require
 from ..io.atomic import read_json, write_json
-from ..io.leftovers import files_in
+from ..io.lock import files_in
 from ..io.provenance import sha256
 from ..version import __version__
 

@@ -264,8 +264,7 @@ def saved_geometry(folder: RunFolder | None, resume: bool) -> Geometry | None:
     if folder is None or not resume or not folder.config.is_file():
         return None
     with as_written(folder.config, "of a run that has begun"):
-        table = folder.read_config().get("decided", {}).get("geometry")
-        return None if table is None else Geometry.from_dict(table)
+        return read_geometry(folder.read_config().get("decided", {}))
 
 
 def still_uncertain(geometry: Geometry, uncertain: PosePrior) -> PosePrior:
@@ -315,9 +314,9 @@ def _moved(changes: np.ndarray, places: tuple[int, ...]) -> bool:
     return bool(np.abs(changes[:, list(places)]).max() > STILL)
 
 
-def read_geometry(summary: Mapping[str, Any]) -> Geometry | None:
-    """That of a run's summary.json; None where nothing was refined."""
-    table = summary.get("geometry")
+def read_geometry(entries: Mapping[str, Any]) -> Geometry | None:
+    """That of entries of a run's file; None where nothing was refined."""
+    table = entries.get("geometry")
     return None if table is None else Geometry.from_dict(table)
 
 

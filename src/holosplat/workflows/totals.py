@@ -69,13 +69,9 @@ class TotalMatter:
             quantity: Literal["δ", "β"] = "δ" if values["quantity"] == "delta" else "β"
             profile = ProfileErrors.from_dict(values["profile"]) if "profile" in values else None
             held = float(values["held_m3"])
-            return cls(quantity, _float(number), _float(error), held, str(values["words"]), profile)
-        except (KeyError, TypeError, ValueError) as error:
-            raise InputError(f"a total must be what reconstruct wrote, but it lacks or garbles {error}.") from error
-
-
-def _float(value: Any) -> float | None:
-    return None if value is None else float(value)
+            return cls(quantity, number, error, held, str(values["words"]), profile)
+        except (KeyError, TypeError, ValueError) as fault:
+            raise InputError(f"a total must be what reconstruct wrote, but it lacks or garbles {fault}.") from fault
 
 
 def total_of_run(said: Prediction, frames: Scan, task: Task, constants: tuple[Determined, ...] = ()) -> TotalMatter:
@@ -87,7 +83,9 @@ def total_of_run(said: Prediction, frames: Scan, task: Task, constants: tuple[De
     """
     found = cast(Stored, said.object)
     quantity: Literal["δ", "β"] = "δ" if task.delta_told else "β"
-    held = _held(found, frames)
+    grid = Grid.of_views(frames[[0]].binned(binning(frames, MOST_VOXELS)).views)
+    delta = np.asarray(found.voxelise(grid).delta, dtype=np.float64)
+    held = float(delta.sum()) * math.prod(grid.voxel_size)
     sign, against = found.matter.channels[0].sign, task.prior.against
     if task.prior.spherical and isinstance(found, VoxelGrid) and bool(found.values.any()):
         fit = SmoothStage(SmoothVolume()).fit(task, found)
@@ -106,7 +104,9 @@ def total_of_run(said: Prediction, frames: Scan, task: Task, constants: tuple[De
     factor = binning(frames, MOST_VOXELS)
     few = frames[chosen]
     predicted = None if _imaged_as_voxels(said, frames, factor) else _predicted(said, few, chosen).binned(factor)
-    noise = _noise(task, frames)[torch.from_numpy(chosen)].binned(factor)
+    noise = (task.noise if len(frames) == len(task.scan) else NoiseModel.of_frames(frames.measured))[
+        torch.from_numpy(chosen)
+    ].binned(factor)
     shown = None if predicted is None else torch.from_numpy(predicted.frames)
     doubt = ratio_doubt(task.prior, constants)
     total = total_delta(found, few.binned(factor), noise, shown, doubt)
@@ -143,18 +143,6 @@ def in_words(
     volume = "" if delta is None else f" ({low / delta:.2g} to {high / delta:.2g} m³ of the material)"
     cannot = "the frames cannot tell it" if ratio_known else "the frames cannot tell it without the ratio δ/β"
     return f"{named}: {cannot}; between {low:.2g} and {high:.2g} m³{volume}{held}"
-
-
-def _held(found: Stored, frames: Scan) -> float:
-    """∫ δ dV [m³] on voxels of at most `MOST_VOXELS`."""
-    grid = Grid.of_views(frames[[0]].binned(binning(frames, MOST_VOXELS)).views)
-    delta = np.asarray(found.voxelise(grid).delta, dtype=np.float64)
-    return float(delta.sum()) * math.prod(grid.voxel_size)
-
-
-def _noise(task: Task, frames: Scan) -> NoiseModel:
-    """The noise of the fitted frames: all that the task has, or what is left when some are set aside."""
-    return task.noise if len(frames) == len(task.scan) else NoiseModel.of_frames(frames.measured)
 
 
 def _imaged_as_voxels(said: Prediction, frames: Scan, factor: int) -> bool:

@@ -112,7 +112,13 @@ def track(
         choice = Choice("levels", {}, "soft fit", found.begun, (*task.decisions, *found.decisions))
         done = _in_motion(found, found.bodies, task, choice, found.oversample)
         if folder is not None:
-            _write(folder, done, found, task)
+            folder.start_metrics(dict.fromkeys(name for record in found.records for name in record))
+            folder.append_metrics(found.records)
+            if found.rest is not None:
+                write_rest(folder, found.rest)
+            told = {"steps": len(found.records), "times_s": task.scan.instants.tolist(), "bodies": found.bodies.count}
+            told |= {"bodies_at_each_time": list(found.found)}
+            write_run(folder, done, task, None, told)
             write_tracks(folder, found.bodies, scan, _more(found, scan))
         return done
 
@@ -150,17 +156,6 @@ def _more(found: Followed, scan: Scan) -> dict[str, np.ndarray]:
     more = {STRAIN: strain_energy(found.bodies, scan.instants, found.rest)} if red_cells and found.rest else {}
     errors = standard_errors(found.bodies, found.halves, scan)
     return more | {f"{ERROR}{name}": values for name, values in errors.items()}
-
-
-def _write(folder: RunFolder, done: Reconstruction, found: Followed, task: Task) -> None:
-    """Write the object, the light, and the records and summary of the fits."""
-    folder.start_metrics(dict.fromkeys(name for record in found.records for name in record))
-    folder.append_metrics(found.records)
-    if found.rest is not None:
-        write_rest(folder, found.rest)
-    told = {"steps": len(found.records), "times_s": task.scan.instants.tolist(), "bodies": found.bodies.count}
-    told |= {"bodies_at_each_time": list(found.found)}
-    write_run(folder, done, task, None, told)
 
 
 def read_errors(folder: RunFolder) -> dict[str, np.ndarray]:

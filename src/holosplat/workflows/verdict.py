@@ -84,7 +84,7 @@ class Verdict:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, ready for JSON; `from_dict` reads them."""
-        arrays = {name: _rounded(getattr(self, name)) for name in POWERS}
+        arrays = {name: [[float(f"{v:.4g}") for v in row] for row in getattr(self, name).tolist()] for name in POWERS}
         periods = [[low, None if math.isinf(high) else high] for low, high in self.periods.tolist()]
         plain = {"good": self.good, "words": self.words, "reasons": list(self.reasons), "periods_m": periods}
         return plain | arrays | {"tested": self.tested, "cause": self.cause}
@@ -130,7 +130,11 @@ def judge(said: Prediction, frames: Scan, noise: NoiseModel | None = None) -> Ve
     found = verdict(left)
     if found.cause == STIFF and isinstance(said.object, VoxelGrid):  # it has neither levels nor sharp edges to give up
         found = replace(found, cause="")
-    absorbing, refracting = _matter(said)
+    views = said.exposures.views
+    few = evenly(len(views), FEW_VIEWS)
+    with torch.no_grad():
+        beta, delta = said.object.project(views[few])
+    absorbing, refracting = beta.abs().cpu(), delta.abs().cpu()
     if not bool(absorbing.any() or refracting.any()):
         return replace(found, good=False, words=NOTHING, reasons=(HELP, *found.reasons)) if found.good else found
     if _shows_nothing(left):
@@ -138,15 +142,6 @@ def judge(said: Prediction, frames: Scan, noise: NoiseModel | None = None) -> Ve
     if found.good or not _leaves_the_field(refracting):
         return found
     return replace(found, reasons=(LEAVES, *found.reasons), cause="")
-
-
-def _matter(said: Prediction) -> tuple[torch.Tensor, torch.Tensor]:
-    """Sizes of the integrals of β and δ through the object [v, H, W] in a few views."""
-    views = said.exposures.views
-    few = evenly(len(views), FEW_VIEWS)
-    with torch.no_grad():
-        beta, delta = said.object.project(views[few])
-    return beta.abs().cpu(), delta.abs().cpu()
 
 
 def _leaves_the_field(matter: torch.Tensor) -> bool:
@@ -384,7 +379,3 @@ def _rms(power: np.ndarray, counts: np.ndarray) -> float:
 def _band(shortest: float, longest: float) -> str:
     low = plain(1e6 * shortest)
     return f"above {low} µm" if math.isinf(longest) else f"of {low} to {plain(1e6 * longest)} µm"
-
-
-def _rounded(values: np.ndarray) -> list[list[float]]:
-    return [[float(f"{v:.4g}") for v in row] for row in values.tolist()]

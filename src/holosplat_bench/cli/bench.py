@@ -19,9 +19,7 @@ from holosplat.ranges import Seed
 
 if TYPE_CHECKING:
     from ..suite.folder import Row
-    from ..suite.methods import BenchMethod
     from ..suite.run import Suite
-    from ..thesis.folder import StudyFolder
 
 
 def thesis(
@@ -63,18 +61,14 @@ def thesis(
     except KeyboardInterrupt:
         interrupted = True
     if not interrupted or any(folder.finished(configuration.name) for configuration in chosen):
-        _report_study(folder)
+        from ..thesis.folder import load_study
+        from ..thesis.pages.page import write_study
+
+        for path in write_study(load_study(folder), folder.path):
+            say(f"wrote {path}")
     if interrupted:
         say(f"interrupted; what is done stays in {out}, and the same command goes on from there")
         raise SystemExit(INTERRUPTED)
-
-
-def _report_study(folder: StudyFolder) -> None:
-    from ..thesis.folder import load_study
-    from ..thesis.pages.page import write_study
-
-    for path in write_study(load_study(folder), folder.path):
-        say(f"wrote {path}")
 
 
 FIRST_SEED = 101
@@ -121,7 +115,10 @@ def run(
     from ..suite.run import Suite, chosen, run_suite
 
     if list_only:
-        _list([*case_names(), *MEASURED], METHODS | ALIGNED)
+        print("cases:", *[*case_names(), *MEASURED], sep="\n  ")
+        print("methods:")
+        for name, method in (METHODS | ALIGNED).items():
+            print(f"  {name:24} {method.family}: {method.summary}")
         return
     table = METHODS | ALIGNED
     wanted = {name: table[name] for name in chosen("--methods", methods or list(METHODS), list(table))}
@@ -196,11 +193,17 @@ def arena(
     from holosplat.io.lock import sole_writer
 
     from ..suite.arena.cases import FAMILIES
-    from ..suite.arena.contest import CONTESTANTS
-    from ..suite.arena.run import Arena, ArenaFolder, chosen_tracks, entry_of, run_arena
+    from ..suite.arena.contest import CONTESTANTS, TRACKS
+    from ..suite.arena.run import Arena, ArenaFolder, entry_of, run_arena
     from ..suite.run import chosen
 
-    made = Arena(chosen("--cases", cases, list(FAMILIES)), chosen_tracks(tracks), draw.seed, draw.size, draw.limit)
+    made = Arena(
+        chosen("--cases", cases, list(FAMILIES)),
+        chosen("--tracks", tracks, list(TRACKS)),
+        draw.seed,
+        draw.size,
+        draw.limit,
+    )
     if list_only:
         print("cases:", *made.cases, sep="\n  ")
         for one in CONTESTANTS:
@@ -309,13 +312,6 @@ def _tell(sources: Mapping[str, str], suite: Suite, folders: Folders, out: Path)
         fewer = (smallest[:count] for count in range(len(smallest) - 1, 0, -1))
         others = ((f"--cases {' '.join(kept)}", of_benchmark([each[name] for name in kept])) for kept in fewer)
         tell("the benchmark", of_benchmark(list(each.values())), out, others)
-
-
-def _list(cases: list[str], methods: Mapping[str, BenchMethod]) -> None:
-    print("cases:", *cases, sep="\n  ")
-    print("methods:")
-    for name, method in methods.items():
-        print(f"  {name:24} {method.family}: {method.summary}")
 
 
 def _kept(out: Path) -> str:

@@ -61,7 +61,17 @@ def svmbir_volume(
     views.parallel("svmbir")
     program, pitch = _svmbir(), views.pixel_size
     views, grid = in_pixels(lines, views, grid)
-    _check(views, grid)
+    require(
+        views.shares_axis,
+        "svmbir needs views that turn about the y axis only, on pixels of one size; take tv, which takes any.",
+    )
+    alike = bool(np.allclose(views.shifts, views.shifts[0], atol=1e-6))
+    require(alike, "svmbir needs one detector shift for all views; align the frames first.")
+    require(rows_match(grid, views), "svmbir needs a grid whose rows along y are the detector's rows.")
+    square = bool(np.isclose(grid.voxel_size[0], grid.voxel_size[2]))
+    require(square, f"svmbir needs square voxels across the axis, but their edges are {grid.voxel_size} pixels.")
+    off = float(np.abs(grid.centre[[0, 2]]).max())
+    require(off < 1e-6, f"svmbir needs a grid with its middle on the rotation axis, but it is {off:g} pixels off.")
     columns, _, rows = grid.shape  # of its image [Y, X, Z]
     on_progress(0.0)
     with tempfile.TemporaryDirectory() as cache:  # its system matrices, which it keeps for ever otherwise
@@ -86,21 +96,6 @@ def svmbir_volume(
             verbose=0,
         )
     return bounded(torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1))), None, upper)
-
-
-def _check(views: Views, grid: Grid) -> None:
-    """`InputError` unless svmbir's geometry, a parallel fan of slices about their middle, is that of the scan."""
-    require(
-        views.shares_axis,
-        "svmbir needs views that turn about the y axis only, on pixels of one size; take tv, which takes any.",
-    )
-    alike = bool(np.allclose(views.shifts, views.shifts[0], atol=1e-6))
-    require(alike, "svmbir needs one detector shift for all views; align the frames first.")
-    require(rows_match(grid, views), "svmbir needs a grid whose rows along y are the detector's rows.")
-    square = bool(np.isclose(grid.voxel_size[0], grid.voxel_size[2]))
-    require(square, f"svmbir needs square voxels across the axis, but their edges are {grid.voxel_size} pixels.")
-    off = float(np.abs(grid.centre[[0, 2]]).max())
-    require(off < 1e-6, f"svmbir needs a grid with its middle on the rotation axis, but it is {off:g} pixels off.")
 
 
 def _svmbir() -> ModuleType:

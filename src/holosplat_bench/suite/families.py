@@ -31,7 +31,7 @@ from holosplat.specimens.scene import MeshScene
 from holosplat.units import wavelength, wavenumber
 from holosplat.workflows.reconstruct import Reconstruction
 
-from .declared import BallStar, BodyWithAbsorber, CoatedDroplets, RoundCell, SheppLogan, Specimen, Tissue
+from .case import BallStar, BodyWithAbsorber, CoatedDroplets, RoundCell, SheppLogan, Specimen, Tissue
 
 
 @dataclass(frozen=True)
@@ -341,7 +341,6 @@ def _either(*kinds: str) -> Callable[[Draw, Room], Matter]:
 
 
 CELLS = _either("red-cells", "soft-cells", "capsules")
-ALL_TOLD = ("ratio", "known", "free")
 SIMULATED: Mapping[str, Family] = {
     "red cells": Family(drawn("red-cells"), told=("ratio", "known")),
     "soft cells": Family(drawn("soft-cells")),

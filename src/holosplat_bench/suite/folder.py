@@ -13,7 +13,7 @@ import numpy as np
 from holosplat.checks import InputError, require
 from holosplat.io.atomic import atomic_path, is_taken, read_json, require_parent, write_json
 from holosplat.io.guard import read_archive
-from holosplat.io.leftovers import is_hidden
+from holosplat.io.lock import is_hidden
 from holosplat.metrics.images import json_number
 
 REFERENCE = "reference"

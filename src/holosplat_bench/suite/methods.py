@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from holosplat.align.initial_geometry import shifts_by_mass
 from holosplat.baselines import TOMOGRAPHIES
 from holosplat.beamline.declaration import Case
 from holosplat.checks import require
-from holosplat.geometry import Grid, Views
+from holosplat.geometry import Grid
 from holosplat.matter import Known, MaterialPrior, Matter
 from holosplat.methods import (
     Auto,
@@ -47,6 +47,7 @@ from holosplat.workflows.reconstruct import reconstruct
 
 from ..opponents.mbir import MbirPerView
 from ..opponents.photographs import AlphaSplats, RadianceFields
+from .folder import REFERENCE
 from .prepare import MeasuredCase
 
 Aligner = Callable[[Scan, MaterialPrior, Progress], Scan]
@@ -79,7 +80,15 @@ def by_reprojection(scan: Scan, prior: MaterialPrior, on_progress: Progress, rou
         plain = in_pixels(views)
         grid = Grid.of_views(in_pixels(scan.views))
         volume = TOMOGRAPHIES["tv"](lines, plain, grid, upper, lambda fraction: None)
-        views = _registered(lines, volume, grid, views)
+        projected, slopes = projections(volume, grid, in_pixels(views))
+        missing = blurred(lines - projected, BLUR).flatten(1).double().numpy()
+        columns = blurred(slopes[:, RIGID], BLUR).flatten(2).double().numpy()
+        rotations, shifts = views.rotations.copy(), views.shifts.copy()
+        for v, (column, left) in enumerate(zip(columns, missing)):
+            x, y, roll = np.linalg.lstsq(column.T, left, rcond=1e-9)[0]
+            rotations[v] = Rotation.from_rotvec([0.0, 0.0, roll]).as_matrix() @ rotations[v]
+            shifts[v] += views.pixel_size * np.array([x, y])
+        views = replace(views, rotations=rotations, shifts=shifts)
         on_progress("reprojection", (n + 1) / rounds)
     return scan.with_views(views)
 
@@ -102,19 +111,6 @@ def _thickness(scan: Scan, prior: MaterialPrior, on_progress: Progress) -> Tenso
     """Retrieved thickness [V, H, W] [m]."""
     material = assumed_material(scan, prior, on_progress)
     return tikhonov(torch.from_numpy(scan.frames), scan.exposures, *material)
-
-
-def _registered(lines: Tensor, volume: Tensor, grid: Grid, views: Views) -> Views:
-    """`views` after a step of shifts and roll by which the projections of `volume` are nearest to `lines` [pixels]."""
-    projected, slopes = projections(volume, grid, in_pixels(views))
-    missing = blurred(lines - projected, BLUR).flatten(1).double().numpy()
-    columns = blurred(slopes[:, RIGID], BLUR).flatten(2).double().numpy()
-    rotations, shifts = views.rotations.copy(), views.shifts.copy()
-    for v, (column, left) in enumerate(zip(columns, missing)):
-        x, y, roll = np.linalg.lstsq(column.T, left, rcond=1e-9)[0]
-        rotations[v] = Rotation.from_rotvec([0.0, 0.0, roll]).as_matrix() @ rotations[v]
-        shifts[v] += views.pixel_size * np.array([x, y])
-    return replace(views, rotations=rotations, shifts=shifts)
 
 
 @dataclass(frozen=True)
@@ -309,6 +305,9 @@ def of_benchmark(cases: Sequence[Needs]) -> Needs:
 class Reference:
     """name: for the table; summary: one line of what it is; run: (case, true volume, on_progress) → Object,
     `InputError` with the reason where the case has no such reference."""
+
+    family: ClassVar[str] = REFERENCE
+    aligner: ClassVar[None] = None
 
     name: str
     summary: str

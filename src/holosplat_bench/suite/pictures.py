@@ -28,7 +28,7 @@ def truth_picture(scan: Scan, truth: Volume) -> Arrays:
     mass = np.abs(truth.delta)
     planes = np.array([int(np.argmax(mass.sum(axis, dtype=np.float64))) for axis in ((1, 2), (0, 2), (0, 1))])
     material, test = robust_material_delta(truth), scan.test()
-    index = _middle(len(test))
+    index = (len(test) - 1) // 2
     return {
         **_slices(truth, planes, material),
         "material": np.array(material),
@@ -58,10 +58,6 @@ def method_picture(found: Volume, scores: Scores, truth: Arrays) -> Arrays:
         "fsc": scores.volume.fsc,
         "pitch": np.array(scores.volume.pitch),
     }
-
-
-def _middle(count: int) -> int:
-    return (count - 1) // 2
 
 
 def _slices(volume: Volume, planes: np.ndarray, material: float) -> Arrays:

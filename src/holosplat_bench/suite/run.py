@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import cast
+from typing import TypeVar, cast
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
@@ -19,7 +19,7 @@ from holosplat.align.held_out import place_frames
 from holosplat.align.poses import PoseOptions
 from holosplat.backends import resolve
 from holosplat.beamline.declaration import Case
-from holosplat.checks import InputError, require
+from holosplat.checks import InputError, reason_of, require
 from holosplat.metrics import resolution
 from holosplat.optics.sampling import fringe_sampling
 from holosplat.progress import Progress
@@ -40,11 +40,12 @@ from holosplat.workflows.evaluate import Scores, score_object
 from holosplat.workflows.provenance import environment, scan_hash
 
 from .arena.contest import status_bytes
-from .folder import REFERENCE, BenchFolder, Row, good_name
+from .folder import BenchFolder, Row, good_name
 from .methods import Aligner, BenchMethod, Reference
 from .pictures import TRUTH, Arrays, method_picture, truth_picture
 from .prepare import MeasuredCase, agreement, prepared
 
+Name = TypeVar("Name", bound=str)
 BLURS = (3.0, 1.0)
 """Gaussian blurs of both volumes [voxels], one after the other: a wide one catches moves of some voxels."""
 ROUNDS = 6
@@ -191,7 +192,7 @@ class Suite:
         return len(self.cases) * len(self.seeds) * len(self.names())
 
 
-def chosen(what: str, wanted: Sequence[str], table: Sequence[str]) -> list[str]:
+def chosen(what: str, wanted: Sequence[str], table: Sequence[Name]) -> list[Name]:
     """The `wanted` names in the `table`'s order, all if none is wanted; `InputError` listing the table otherwise."""
     unknown = [name for name in wanted if name not in table]
     if unknown:
@@ -219,30 +220,22 @@ def run_suite(
         for seed in suite.seeds
     }
     left = sum(len(names) for names in missing.values())
+    tables = (suite.references, suite.methods)
+    jobs = [(place, method, job) for table in tables for place, (method, job) in enumerate(table.items())]
     for (name, seed), wanted in missing.items():
         if not wanted:
             continue
         on_progress(f"{name} {seed}: scene and scan", 0.0)
         bench = _Bench.of(suite.load(name, seed), folder, on_progress)
-        for job in _jobs(suite, bench, wanted):
-            row, picture = bench.attempt(job)
+        for place, method, job in jobs:
+            if method not in wanted:
+                continue
+            row, picture = bench.attempt(method, job, place)
             if picture:  # before the row, which marks both as done
                 folder.write_picture(row.case, row.seed, row.method, picture)
             folder.write_row(row)
             left -= 1
             on_row(row, left)
-
-
-@dataclass(frozen=True)
-class _Job:
-    """One row to be made."""
-
-    name: str
-    family: str
-    summary: str
-    place: int
-    produce: Callable[[Progress], Object]
-    aligner: Aligner | None = None
 
 
 def stored_bytes(found: Stored) -> int:
@@ -278,20 +271,20 @@ class _Bench:
         folder.write_picture(case.name, case.seed, TRUTH, picture)
         hashed, commit = scan_hash(scan), source_commit()
         blank = Row(case.name, case.seed, "", "", "", 0, "failed", "", hashed, commit, "")
-        blank = replace(blank, **environment(_backend()))
+        blank = replace(blank, **environment(resolve("auto")))
         return cls(case, scan, truth, picture, blank, on_progress)
 
-    def attempt(self, job: _Job) -> tuple[Row, Arrays | None]:
-        """The row of a job and, if it has a result, its picture."""
-        row = replace(self.blank, method=job.name, family=job.family, summary=job.summary, place=job.place)
+    def attempt(self, name: str, job: BenchMethod | Reference, place: int) -> tuple[Row, Arrays | None]:
+        """The row of a method or reference and, if it has a result, its picture."""
+        row = replace(self.blank, method=name, family=job.family, summary=job.summary, place=place)
         picture = None
-        stage = f"{row.case} {row.seed} {job.name}: "
+        stage = f"{row.case} {row.seed} {name}: "
         gc.collect()  # of the method before
         try:
             with memory_growth() as growth:
                 before = self.aligned[job.aligner][1] if job.aligner and job.aligner in self.aligned else 0.0
                 began = time.perf_counter() - before
-                found = job.produce(lambda what, fraction: self.on_progress(stage + what, fraction))
+                found = self._produced(job, lambda what, fraction: self.on_progress(stage + what, fraction))
                 row = replace(row, seconds=time.perf_counter() - began, memory_bytes=growth())
             self.on_progress(stage + "scores", 0.0)
             scores, picture = self._judged(found, stage)
@@ -299,12 +292,22 @@ class _Bench:
             row = replace(row, status="done", stored_bytes=size, **_numbers(scores))
             if isinstance(self.case, MeasuredCase):
                 row.volume.update(agreement(found.voxelise(self.truth.grid), self.truth))
-        except InputError as error:
-            row = replace(row, reason=str(error))
         except Exception as error:  # one method's fault must not take the others' results
-            lines = str(error).strip().splitlines()
-            row = replace(row, reason=": ".join([type(error).__name__, *lines[-1:]]))
+            row = replace(row, reason=reason_of(error))
         return replace(row, when=datetime.now(UTC).isoformat(timespec="seconds")), picture
+
+    def _produced(self, job: BenchMethod | Reference, on_progress: Progress) -> Object:
+        """What a job makes; training frames that an aligner has placed are kept for others that need them."""
+        if isinstance(job, Reference):
+            return job.run(self.case, self.truth, on_progress)
+        scan, aligner = self.scan.train(), job.aligner
+        if aligner is not None:
+            if aligner not in self.aligned:
+                began = time.perf_counter()
+                placed = aligner(scan, self.case.prior, on_progress)
+                self.aligned[aligner] = placed, time.perf_counter() - began
+            scan = self.aligned[aligner][0]
+        return replace(job, aligner=None).run(scan, self.case.prior, self.case.seed, on_progress)
 
     def _judged(self, found: Object, stage: str) -> tuple[Scores, Arrays]:
         oversample, scan, truth = fringe_sampling(self.scan.exposures), self.scan, self.truth
@@ -318,43 +321,6 @@ class _Bench:
         if self.case.balls:
             picture["diameters"], picture["contrast"] = contrast_by_size(volume, self.truth, self.case.balls)
         return scores, picture
-
-
-def _backend() -> str:
-    """What fits compute on where the choice is theirs."""
-    return resolve("auto")
-
-
-def _jobs(suite: Suite, bench: _Bench, wanted: Sequence[str]) -> Iterator[_Job]:
-    case, train = bench.case, bench.scan.train()
-    for place, (name, reference) in enumerate(suite.references.items()):
-        if name in wanted:
-            yield _Job(name, REFERENCE, reference.summary, place, _of_reference(reference, bench))
-    for place, (name, method) in enumerate(suite.methods.items()):
-        if name in wanted:
-            yield _Job(
-                name, method.family, method.summary, place, _of_method(method, train, case, bench), method.aligner
-            )
-
-
-def _of_reference(reference: Reference, bench: _Bench) -> Callable[[Progress], Object]:
-    return lambda on_progress: reference.run(bench.case, bench.truth, on_progress)
-
-
-def _of_method(
-    method: BenchMethod, train: Scan, case: Case | MeasuredCase, bench: _Bench
-) -> Callable[[Progress], Object]:
-    def produce(on_progress: Progress) -> Object:
-        scan, aligner = train, method.aligner
-        if aligner is not None:
-            if aligner not in bench.aligned:
-                began = time.perf_counter()
-                found = aligner(train, case.prior, on_progress)
-                bench.aligned[aligner] = found, time.perf_counter() - began
-            scan = bench.aligned[aligner][0]
-        return replace(method, aligner=None).run(scan, case.prior, case.seed, on_progress)
-
-    return produce
 
 
 def _numbers(scores: Scores) -> dict[str, dict[str, float | None]]:

@@ -17,7 +17,6 @@ from functools import cache
 from importlib.resources import files
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 import torch
 from markupsafe import Markup
@@ -28,6 +27,7 @@ from ...representations import GaussianCloud, MovingSurfaces, Stored, SurfaceMes
 from ...scan import Exposures
 from ...units import wavenumber
 from ...volume import Volume
+from ..style import palette
 
 MOST_COLUMNS = 320
 """Raster pixels along the longer edge of the view's frame."""
@@ -110,14 +110,8 @@ def packed(view: View3D) -> tuple[dict[str, Any], bytes]:
         "grey": list(view.grey),
         "phase": view.ends,
         "delta_told": view.delta_told,
-        "colours": _colours(),
+        "colours": palette().ravel().tolist(),
     }, bytes(blob)
-
-
-@cache
-def _colours() -> list[int]:
-    """256 colours from dark to light, as red, green and blue in turn."""
-    return np.rint(255 * mpl.colormaps["magma"](np.linspace(0, 1, 256))[:, :3]).astype(int).ravel().tolist()
 
 
 @cache
@@ -162,9 +156,21 @@ def part_of(obj: Stored, volume: Volume, pixel: float, times: np.ndarray | None 
     if isinstance(obj, GaussianCloud) and (found := _gaussians(obj, pixel)):
         return found
     if isinstance(obj, SurfaceMesh) and len(obj.faces) <= MOST_FACES:
-        return _surfaces(obj, pixel)
+        vertices = obj.vertices.detach().double().numpy() * (obj.unit_length / pixel)
+        bits, low, step = _in_bits(vertices, 16)
+        arrays = {"vertices": bits, "faces": _small(obj.faces.numpy())}
+        return ViewPart("surfaces", arrays, {"low": low, "step": step}, _channels(obj.matter))
     if isinstance(obj, MovingSurfaces) and times is not None and obj.coefficients[..., 0].numel() <= MOST_COEFFICIENTS:
-        return _paths(obj, pixel, times)
+        coefficients = obj.coefficients.detach().double().numpy() * (obj.unit_length / pixel)
+        bits, low, step = _in_bits(coefficients, 16)
+        shown = np.linspace(times[0], times[-1], min(MOST_TIMES, 4 * len(times) - 3))
+        arrays = {
+            "coefficients": bits,
+            "faces": _small(obj.faces.numpy()),
+            "weights": obj.basis.weights(shown).astype(np.float32),
+        }
+        facts = {"low": low, "step": step, "paths": len(bits), "times_us": [round(1e6 * t, 4) for t in shown]}
+        return ViewPart("paths", arrays, facts, _channels(obj.matter))
     return volume_part(volume, pixel, VOLUME_BYTES)
 
 
@@ -244,26 +250,6 @@ def _gaussians(cloud: GaussianCloud, pixel: float) -> ViewPart | None:
             "amplitudes": cloud.amplitudes.numpy()[kept].astype(np.float16),
         }
     return ViewPart("gaussians", arrays, {"low": low, "step": step, "count": len(kept)}, _channels(cloud.matter))
-
-
-def _surfaces(obj: SurfaceMesh, pixel: float) -> ViewPart:
-    vertices = obj.vertices.detach().double().numpy() * (obj.unit_length / pixel)
-    bits, low, step = _in_bits(vertices, 16)
-    arrays = {"vertices": bits, "faces": _small(obj.faces.numpy())}
-    return ViewPart("surfaces", arrays, {"low": low, "step": step}, _channels(obj.matter))
-
-
-def _paths(obj: MovingSurfaces, pixel: float, times: np.ndarray) -> ViewPart:
-    coefficients = obj.coefficients.detach().double().numpy() * (obj.unit_length / pixel)
-    bits, low, step = _in_bits(coefficients, 16)
-    shown = np.linspace(times[0], times[-1], min(MOST_TIMES, 4 * len(times) - 3))
-    arrays = {
-        "coefficients": bits,
-        "faces": _small(obj.faces.numpy()),
-        "weights": obj.basis.weights(shown).astype(np.float32),
-    }
-    facts = {"low": low, "step": step, "paths": len(bits), "times_us": [round(1e6 * t, 4) for t in shown]}
-    return ViewPart("paths", arrays, facts, _channels(obj.matter))
 
 
 def _channels(matter: Matter) -> tuple[tuple[float, float], ...]:

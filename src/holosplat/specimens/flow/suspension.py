@@ -303,15 +303,10 @@ class Suspension:
         way = centres[second] - centres[first]
         period = self.channel.box[0]
         way = torch.cat([way[:, :1] - period * torch.round(way[:, :1] / period), way[:, 1:]], dim=1)
-        weight = _fading(way.norm(dim=-1) / self.reach)
+        s = (2 - 2 * (way.norm(dim=-1) / self.reach)).clamp(0, 1)  # 1 up to half the reach, 0 from it on
+        weight = s**3 * (10 - 15 * s + 6 * s**2)
         near = torch.nonzero(weight > 0)[:, 0]
         return first[near], second[near], way[near], weight[near]
-
-
-def _fading(ratio: Tensor) -> Tensor:
-    """1 up to a half, 0 from 1 on, smooth in between."""
-    s = (2 - 2 * ratio).clamp(0, 1)
-    return s**3 * (10 - 15 * s + 6 * s**2)
 
 
 SAFETY, SHRINK, GROW = 0.9, 0.2, 3.0

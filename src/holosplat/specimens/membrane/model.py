@@ -165,22 +165,27 @@ class Membrane:
 
     def energies(self, nodes: Tensor) -> dict[str, Tensor]:
         """Each energy [...] [J] with a modulus other than 0, by its name."""
-        of, rest = self.elasticity, self.rest
-        found = {}
-        if of.springs:
-            found["stretching"] = stretching_energy(nodes, rest, of.springs)
-        if of.linear_springs:
-            found["linear stretching"] = linear_energy(nodes, rest, of.linear_springs)
-        if of.skalak_shear:
-            found["skalak"] = skalak_energy(nodes, rest, of.skalak_shear, of.skalak_dilation)
-        if of.bending:
-            found["bending"] = bending_energy(nodes, rest, of.bending)
-        if of.local_area:
-            found["local area"] = local_area_energy(nodes, rest, of.local_area)
-        if of.global_area:
-            found["global area"] = global_area_energy(nodes, rest, of.global_area)
-        if of.volume:
-            found["volume"] = volume_energy(nodes, rest, of.volume)
+        of, rest, shape = self.elasticity, self.rest, Shape.of(nodes, self.rest)
+        length, found = edge_lengths(nodes, rest.edges), dict[str, Tensor]()
+        if of.springs:  # Σ k L₀² ∫₁^λ κ(s) (s - 1) ds, λ = L/L₀, κ from `neo_hookean`
+            work = _spring(length / rest.length) - _spring(torch.ones_like(rest.length))
+            found["stretching"] = of.springs * (rest.length**2 * work).sum(-1)
+        if of.linear_springs:  # Σ k/2 (L - L₀)² over edges
+            found["linear stretching"] = 0.5 * of.linear_springs * ((length - rest.length) ** 2).sum(-1)
+        if of.skalak_shear:  # ∫ G/4 (I₁² + 2 I₁ - 2 I₂ + C I₂²) dA₀, I₁ = tr FᵀF - 2, I₂ = det FᵀF - 1 (Skalak 1973)
+            first, second = strain_invariants(deformation_gradient(shape.corners, rest))
+            density = 0.25 * of.skalak_shear * (first**2 + 2 * first - 2 * second + of.skalak_dilation * second**2)
+            found["skalak"] = (rest.area * density).sum(-1)
+        if of.bending:  # Σ k/2 (θ - θ₀)², θ between the triangles beside an edge; on even triangles k = 2κ/√3 gives the
+            # bending rigidity κ (Seung & Nelson 1988, Phys. Rev. A 38, 1005)
+            turn = dihedral_angles(nodes, rest.edges, rest.opposite) - rest.angle
+            found["bending"] = 0.5 * of.bending * (turn**2).sum(-1)
+        if of.local_area:  # Σ k/2 (A - A₀)²/A₀ over triangles
+            found["local area"] = 0.5 * of.local_area * ((shape.areas - rest.area) ** 2 / rest.area).sum(-1)
+        if of.global_area:  # k/2 (S - S₀)²/S₀ of the whole surface
+            found["global area"] = 0.5 * of.global_area * (shape.areas.sum(-1) - rest.surface) ** 2 / rest.surface
+        if of.volume:  # k/2 (V - V₀)²/V₀
+            found["volume"] = 0.5 * of.volume * (enclosed_volume(shape.corners) - rest.volume) ** 2 / rest.volume
         return found
 
     def energy(self, nodes: Tensor) -> Tensor:
@@ -217,17 +222,6 @@ ROOTS = tuple((math.cos(math.pi * k / 8), math.sin(math.pi * k / 8)) for k in (1
 """Real and imaginary parts of the roots of u⁸ = -1 in the upper half plane."""
 
 
-def stretching_energy(nodes: Tensor, rest: RestShape, stiffness: float) -> Tensor:
-    """Springs along edges, stiffness k [N/m]: Σ k L₀² ∫₁^λ κ(s) (s - 1) ds, λ = L/L₀, κ from `neo_hookean`."""
-    ratio = edge_lengths(nodes, rest.edges) / rest.length
-    return stiffness * (rest.length**2 * (_spring(ratio) - _spring(torch.ones_like(rest.length)))).sum(-1)
-
-
-def linear_energy(nodes: Tensor, rest: RestShape, stiffness: float) -> Tensor:
-    """Springs that do not soften, Σ k/2 (L - L₀)² over edges; stiffness k [N/m]."""
-    return 0.5 * stiffness * ((edge_lengths(nodes, rest.edges) - rest.length) ** 2).sum(-1)
-
-
 def neo_hookean(ratio: Tensor) -> Tensor:
     """κ(λ) = (λ^½ + λ^-2.5)/(λ + λ⁻³): springs soften as rubber does (Dupin 2007, eq. 19)."""
     return (ratio**0.5 + ratio**-2.5) / (ratio + ratio**-3)
@@ -244,44 +238,6 @@ def _spring(ratio: Tensor) -> Tensor:
         direction = torch.atan2(torch.full_like(u, imaginary), u - real)
         total = total + 4 * (weight.real * distance + weight.imag * direction)
     return total
-
-
-def bending_energy(nodes: Tensor, rest: RestShape, stiffness: float) -> Tensor:
-    """Σ over edges k/2 (θ - θ₀)², θ the angle between the triangles beside it; stiffness k [J].
-
-    On even triangles k = 2κ/√3 gives the bending rigidity κ (Seung & Nelson 1988, Phys. Rev. A 38, 1005).
-    """
-    turn = dihedral_angles(nodes, rest.edges, rest.opposite) - rest.angle
-    return 0.5 * stiffness * (turn**2).sum(-1)
-
-
-def local_area_energy(nodes: Tensor, rest: RestShape, modulus: float) -> Tensor:
-    """Σ over triangles k/2 (A - A₀)²/A₀; modulus k [N/m]."""
-    areas = triangle_areas(corners_of(nodes, rest.faces))
-    return 0.5 * modulus * ((areas - rest.area) ** 2 / rest.area).sum(-1)
-
-
-def global_area_energy(nodes: Tensor, rest: RestShape, modulus: float) -> Tensor:
-    """k/2 (S - S₀)²/S₀ of the whole surface S; modulus k [N/m]."""
-    surface = triangle_areas(corners_of(nodes, rest.faces)).sum(-1)
-    return 0.5 * modulus * (surface - rest.surface) ** 2 / rest.surface
-
-
-def volume_energy(nodes: Tensor, rest: RestShape, modulus: float) -> Tensor:
-    """k/2 (V - V₀)²/V₀; modulus k [N/m²]."""
-    volume = enclosed_volume(corners_of(nodes, rest.faces))
-    return 0.5 * modulus * (volume - rest.volume) ** 2 / rest.volume
-
-
-def skalak_energy(nodes: Tensor, rest: RestShape, shear: float, dilation: float) -> Tensor:
-    """∫ G/4 (I₁² + 2 I₁ - 2 I₂ + C I₂²) dA₀, I₁ = tr FᵀF - 2, I₂ = det FᵀF - 1 (Skalak 1973).
-
-    shear: modulus G [N/m]; dilation: the number C, the area modulus being G (1 + 2 C). F is constant on a triangle.
-    """
-    gradient = deformation_gradient(corners_of(nodes, rest.faces), rest)
-    first, second = strain_invariants(gradient)
-    density = 0.25 * shear * (first**2 + 2 * first - 2 * second + dilation * second**2)
-    return (rest.area * density).sum(-1)
 
 
 def deformation_gradient(corners: Tensor, rest: RestShape) -> Tensor:

@@ -208,7 +208,8 @@ def _even_sphere(frequency: int) -> tuple[np.ndarray, np.ndarray]:
     def unevenness(flat: np.ndarray) -> tuple[float, np.ndarray]:
         points = torch.from_numpy(flat.reshape(-1, 3).copy()).requires_grad_()
         on_sphere = points / points.norm(dim=-1, keepdim=True)
-        nodes = _on_cell(on_sphere)
+        x, y, z = on_sphere.unbind(-1)
+        nodes = torch.stack([x, y, z * half_thickness(x**2 + y**2)], dim=-1)
         square = edge_lengths(nodes, shape.edges) ** 2
         areas = triangle_areas(corners_of(nodes, shape.faces))
         value = ((square / square.mean() - 1) ** 2).sum() + ((areas / areas.mean() - 1) ** 2).sum()
@@ -220,9 +221,3 @@ def _even_sphere(frequency: int) -> tuple[np.ndarray, np.ndarray]:
     points = points / np.linalg.norm(points, axis=1, keepdims=True)
     points.flags.writeable = False
     return points, faces
-
-
-def _on_cell(sphere: torch.Tensor) -> torch.Tensor:
-    """As `RedCell().surface`, in radii, for tensors."""
-    x, y, z = sphere.unbind(-1)
-    return torch.stack([x, y, z * half_thickness(x**2 + y**2)], dim=-1)

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from holosplat.baselines import HolographicTV, holographic_tv
-from holosplat.checks import at_least, positive, require
+from holosplat.checks import at_least, positive, require_shapes
 from holosplat.fit.loop import Fit
 from holosplat.geometry import Grid
 from holosplat.matter import Matter
@@ -114,11 +114,7 @@ class DeformedVoxels(OnVoxels):
         super().__init__(grid, times, matter, upper)
         canonical, weights = parts
         wanted = {"canonical": options.canonical_shape(grid)} | options.shapes()
-        given = {"canonical": canonical, **weights}
-        for name in {**wanted, **given}:
-            shape = tuple(given[name].shape) if name in given else None
-            right = wanted.get(name)
-            require(shape == right, f"{name} of deformed voxels must have the shape {right}, but it has {shape}.")
+        require_shapes("{} of deformed voxels", {"canonical": canonical, **weights}, wanted)
         self.canonical, self.weights, self.options = canonical, dict(weights), options
         self._axes = tuple(hats(n, max(1, round((n - 1) / options.cell_px) + 1)) for n in grid.shape)
         self._encoded = _waves(_lattice([a.shape[1] for a in self._axes], grid), options.place_frequencies)

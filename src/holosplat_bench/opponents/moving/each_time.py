@@ -98,20 +98,6 @@ def require_times(train: Scan) -> np.ndarray:
     return train.instants
 
 
-def series_of(task: Task, options: HolographicTV) -> VoxelSeries:
-    """Volumes of all times of the scan, each by itself by total variation (`holographic_tv`), as one object."""
-    times = require_times(task.scan)
-    middle = task.scan.at_instant(len(times) // 2)
-    material = assumed_material(middle, task.prior, task.on_progress, options.backend)
-    bounded, volumes, grid = replace(options, upper=task.bound(1.0)), list[torch.Tensor](), None
-    for k in range(len(times)):
-        task.on_progress(EACH, k / len(times))
-        values, grid = holographic_tv(task.scan.at_instant(k), material, bounded, quiet)
-        volumes.append(values.float())
-    assert grid is not None
-    return VoxelSeries(torch.stack(volumes), grid, times, Matter.one(*material), task.bound(1.0))
-
-
 def usual_start() -> HolographicTV:
     """On voxels of a pixel, and none beyond the field, so that all times have the same ones."""
     return HolographicTV(refine=1, beyond=False)
@@ -126,7 +112,16 @@ class EachTimeStage:
 
     def start(self, task: Task, before: Stored | None) -> VoxelSeries:
         """The volumes; `InputError` for a scan of one time."""
-        return series_of(task, self.volume)
+        times = require_times(task.scan)
+        middle = task.scan.at_instant(len(times) // 2)
+        material = assumed_material(middle, task.prior, task.on_progress, self.volume.backend)
+        bounded, volumes, grid = replace(self.volume, upper=task.bound(1.0)), list[torch.Tensor](), None
+        for k in range(len(times)):
+            task.on_progress(EACH, k / len(times))
+            values, grid = holographic_tv(task.scan.at_instant(k), material, bounded, quiet)
+            volumes.append(values.float())
+        assert grid is not None
+        return VoxelSeries(torch.stack(volumes), grid, times, Matter.one(*material), task.bound(1.0))
 
     def fit(self, task: Task, start: Stored) -> None:
         """Nothing is fitted."""

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 from holosplat.baselines import HolographicTV
-from holosplat.checks import at_least, positive, require
+from holosplat.checks import at_least, positive, require, require_shapes
 from holosplat.fit.loop import Fit
 from holosplat.geometry import Grid
 from holosplat.matter import Matter
@@ -113,10 +113,7 @@ class HexPlaneField(OnVoxels):
     ) -> None:
         super().__init__(grid, times, matter, upper)
         wanted = options.shapes(grid, len(self.times))
-        for name in {**wanted, **weights}:
-            shape = tuple(weights[name].shape) if name in weights else None
-            right = wanted.get(name)
-            require(shape == right, f"{name} of a hexplane field must have the shape {right}, but it has {shape}.")
+        require_shapes("{} of a hexplane field", weights, wanted)
         self.options, self._weights = options, {name: weights[name] for name in wanted}
         self._nodes = np.linspace(self.times[0], self.times[-1], options.time_nodes or len(self.times))
         self._axes = {axis: hats(n, options.nodes(n)) for axis, n in zip("zyx", grid.shape)}

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from holosplat.backends import in_main_memory
-from holosplat.checks import require
+from holosplat.checks import require, require_shapes
 from holosplat.display import of_object
 from holosplat.geometry import Grid, Poses, Views
 from holosplat.matter import Matter
@@ -23,13 +23,15 @@ from holosplat.volume import LineIntegrals, Volume
 class OnVoxels:
     """Base of moving objects whose matter is an occupancy of one material on one grid at any time.
 
-    A kind of it says `values(time)`, `parameters()`, how tensors take the place of these (`_put`), and `state()`.
+    A kind of it says `values(time)`, and which attributes are its trainable tensors (`names`), or `parameters()`, how
+    tensors take the place of these (`_put`), and `state()`.
 
     grid: the voxels; times: [T] [s], in order, which it is made for; matter: of one material; upper: bound of the
     occupancy (0: none). Errors: `InputError` for more than one material, and times that do not grow.
     """
 
     kind: ClassVar[str]
+    names: ClassVar[tuple[str, ...]] = ()
     _repr_html_ = of_object
 
     def __init__(self, grid: Grid, times: Sequence[float] | np.ndarray, matter: Matter, upper: float = 0.0) -> None:
@@ -46,10 +48,15 @@ class OnVoxels:
 
     def parameters(self) -> dict[str, Tensor]:
         """The trainable tensors, by name."""
-        raise NotImplementedError
+        return {name: getattr(self, name) for name in self.names}
 
     def _put(self, parameters: Mapping[str, Tensor]) -> None:
-        raise NotImplementedError
+        for name in self.names:
+            setattr(self, name, parameters.get(name, getattr(self, name)))
+
+    def state(self) -> dict[str, Any]:
+        """Tensors and plain values that `from_state` makes the same matter of."""
+        return {**self.parameters(), **self._plain()}
 
     def with_parameters(self, parameters: Mapping[str, Tensor]) -> Self:
         """The same matter with other tensors in the place of those named; it shares the projectors that are ready."""
@@ -120,20 +127,14 @@ class VoxelSeries(OnVoxels):
     """
 
     kind: ClassVar[str] = "voxel-series"
+    names: ClassVar[tuple[str, ...]] = ("volumes",)
 
     def __init__(
         self, volumes: Tensor, grid: Grid, times: Sequence[float] | np.ndarray, matter: Matter, upper: float = 0.0
     ) -> None:
         super().__init__(grid, times, matter, upper)
-        _require_shape("the volumes of a voxel series", volumes, (len(self.times), *grid.shape))
+        require_shapes("{} of a voxel series", {"volumes": volumes}, {"volumes": (len(self.times), *grid.shape)})
         self.volumes = volumes
-
-    def parameters(self) -> dict[str, Tensor]:
-        """The trainable tensor, by name."""
-        return {"volumes": self.volumes}
-
-    def _put(self, parameters: Mapping[str, Tensor]) -> None:
-        self.volumes = parameters.get("volumes", self.volumes)
 
     def values(self, time: float) -> Tensor:
         """Occupancies [Z, Y, X] at `time` [s]."""
@@ -144,10 +145,6 @@ class VoxelSeries(OnVoxels):
     def described(self) -> str:
         """How large it is, in words."""
         return " × ".join(map(str, self.grid.shape)) + f" voxels at {len(self.times)} times"
-
-    def state(self) -> dict[str, Any]:
-        """Tensors and plain values that `from_state` makes the same series of."""
-        return {"volumes": self.volumes, **self._plain()}
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> VoxelSeries:
@@ -165,6 +162,7 @@ class LowRankVoxels(OnVoxels):
     """
 
     kind: ClassVar[str] = "low-rank-voxels"
+    names: ClassVar[tuple[str, ...]] = ("volumes", "courses")
 
     def __init__(
         self,
@@ -179,8 +177,8 @@ class LowRankVoxels(OnVoxels):
         volumes, courses = factors
         rank = volumes.shape[0] if volumes.ndim else 0
         require(rank >= 1, "voxels of low rank need one volume at least.")
-        _require_shape("the volumes of voxels of low rank", volumes, (rank, *grid.shape))
-        _require_shape("the courses of voxels of low rank", courses, (rank, len(self.times)))
+        wanted = {"volumes": (rank, *grid.shape), "courses": (rank, len(self.times))}
+        require_shapes("{} of voxels of low rank", {"volumes": volumes, "courses": courses}, wanted)
         self.volumes, self.courses = volumes, courses
 
     @classmethod
@@ -198,14 +196,6 @@ class LowRankVoxels(OnVoxels):
         volumes = (courses @ flat / count).reshape(-1, *series.grid.shape)
         return cls((volumes, courses), series.grid, series.times, series.matter, series.upper)
 
-    def parameters(self) -> dict[str, Tensor]:
-        """The trainable tensors, by name."""
-        return {"volumes": self.volumes, "courses": self.courses}
-
-    def _put(self, parameters: Mapping[str, Tensor]) -> None:
-        self.volumes = parameters.get("volumes", self.volumes)
-        self.courses = parameters.get("courses", self.courses)
-
     def values(self, time: float) -> Tensor:
         """Occupancies [Z, Y, X] at `time` [s]."""
         course = self.courses @ self.between(time).to(self.courses)
@@ -216,10 +206,6 @@ class LowRankVoxels(OnVoxels):
         """How large it is, in words."""
         voxels = " × ".join(map(str, self.grid.shape))
         return f"{len(self.courses)} volumes of {voxels} voxels that mix at {len(self.times)} times"
-
-    def state(self) -> dict[str, Any]:
-        """Tensors and plain values that `from_state` makes the same matter of."""
-        return {"volumes": self.volumes, "courses": self.courses, **self._plain()}
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> LowRankVoxels:
@@ -250,8 +236,3 @@ class _Held(torch.autograd.Function):
         (values,) = ctx.saved_tensors
         away = ((values < 0) & (upstream > 0)) | ((values > ctx.upper) & (upstream < 0))
         return upstream.masked_fill(away, 0.0), None
-
-
-def _require_shape(name: str, given: Tensor, wanted: tuple[int, ...]) -> None:
-    shape = tuple(given.shape)
-    require(shape == wanted, f"{name} must have the shape {wanted}, but it is {shape}.")

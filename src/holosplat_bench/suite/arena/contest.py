@@ -153,19 +153,14 @@ def compete(act: str, question: Question, calls: int, limit: float) -> Outcome:
             except subprocess.TimeoutExpired:
                 return Outcome(None, f"stopped after {limit:g} s")
             finally:
-                _end(process)
+                with contextlib.suppress(ProcessLookupError):
+                    os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
         if code == 0 and answered.is_file():
             held = read_archive(answered, what="an answer of the arena")
             spent, peak = float(held.pop(SPENT)), int(held.pop(PEAK))
             return Outcome(held, "", spent, peak)
         return Outcome(None, _why(code, said.read_text(encoding="utf-8", errors="replace")))
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """End a contestant with all that it started."""
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
 
 
 def _why(code: int, said: str) -> str:

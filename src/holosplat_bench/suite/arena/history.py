@@ -11,7 +11,7 @@ from typing import Any
 
 from holosplat.checks import require
 from holosplat.io.atomic import read_json, write_json
-from holosplat.io.leftovers import RECORD
+from holosplat.io.lock import RECORD
 from holosplat.metrics.images import json_number
 
 from ..folder import Row

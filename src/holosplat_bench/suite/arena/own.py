@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
@@ -77,14 +78,10 @@ def _retrieval(name: str, question: Question) -> Callable[[], Answer]:
     return run
 
 
-def contrast_transfer(question: Question) -> Callable[[], Answer]:
-    """Retrieval: the linear inverse."""
-    return _retrieval("ctf", question)
-
-
-def tikhonov(question: Question) -> Callable[[], Answer]:
-    """Retrieval: nonlinear, with positivity; what the tomographies are given, too."""
-    return _retrieval("tikhonov", question)
+contrast_transfer = partial(_retrieval, "ctf")
+"""Retrieval: the linear inverse."""
+tikhonov = partial(_retrieval, "tikhonov")
+"""Retrieval: nonlinear, with positivity; what the tomographies are given, too."""
 
 
 def _tomography(name: str, question: Question) -> Callable[[], Answer]:
@@ -99,22 +96,15 @@ def _tomography(name: str, question: Question) -> Callable[[], Answer]:
     return run
 
 
-def backprojection(question: Question) -> Callable[[], Answer]:
-    """Tomography: filtered back-projection."""
-    return _tomography("fbp", question)
+backprojection = partial(_tomography, "fbp")
+"""Tomography: filtered back-projection."""
+sirt = partial(_tomography, "sirt-nonneg")
+"""Tomography: SIRT without negative values."""
+total_variation = partial(_tomography, "tv")
+"""Tomography: total variation without negative values."""
 
 
-def sirt(question: Question) -> Callable[[], Answer]:
-    """Tomography: SIRT without negative values."""
-    return _tomography("sirt-nonneg", question)
-
-
-def total_variation(question: Question) -> Callable[[], Answer]:
-    """Tomography: total variation without negative values."""
-    return _tomography("tv", question)
-
-
-def _job(question: Question, method: str) -> Callable[[], Answer]:
+def _job(method: str, question: Question) -> Callable[[], Answer]:
     from holosplat.methods import METHODS
     from holosplat.workflows.reconstruct import reconstruct
 
@@ -130,11 +120,7 @@ def _job(question: Question, method: str) -> Callable[[], Answer]:
     return run
 
 
-def default(question: Question) -> Callable[[], Answer]:
-    """Jobs: what `holosplat reconstruct` does by itself."""
-    return _job(question, "auto")
-
-
-def two_steps(question: Question) -> Callable[[], Answer]:
-    """Jobs: nonlinear Tikhonov retrieval of each view, then total variation."""
-    return _job(question, "tikhonov-tv")
+default = partial(_job, "auto")
+"""Jobs: what `holosplat reconstruct` does by itself."""
+two_steps = partial(_job, "tikhonov-tv")
+"""Jobs: nonlinear Tikhonov retrieval of each view, then total variation."""

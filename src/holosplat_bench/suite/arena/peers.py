@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import io
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -67,21 +68,17 @@ class _Astra:
         return volume
 
 
-def _astra_pair(question: Question, model: str) -> Callable[[], Answer]:
+def _astra_pair(model: str, question: Question) -> Callable[[], Answer]:
     astra = _Astra(question, model)
     forward, back = astra.algorithm("FP"), astra.algorithm("BP")
     volume, lines = question.volume.astype(np.float32), question.lines.astype(np.float32)
     return lambda: {"lines": astra.project(forward, volume), "volume": astra.reconstruct(back, lines)}
 
 
-def astra_strip(question: Question) -> Callable[[], Answer]:
-    """Kernels: strips as wide as a pixel."""
-    return _astra_pair(question, "strip")
-
-
-def astra_linear(question: Question) -> Callable[[], Answer]:
-    """Kernels: Joseph's interpolation along a ray."""
-    return _astra_pair(question, "linear")
+astra_strip = partial(_astra_pair, "strip")
+"""Kernels: strips as wide as a pixel."""
+astra_linear = partial(_astra_pair, "linear")
+"""Kernels: Joseph's interpolation along a ray."""
 
 
 def astra_backprojection(question: Question) -> Callable[[], Answer]:

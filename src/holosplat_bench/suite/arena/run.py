@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from importlib import metadata
@@ -204,9 +204,6 @@ class _Judge:
             return {"error": _relative(_shaped(answer["gradient"], wanted.shape), wanted)}
         if track == "retrieval":
             return {"error": _relative(_shaped(answer["lines"], self.case.lines.shape), self.case.lines)}
-        return self._of_volume(answer)
-
-    def _of_volume(self, answer: Answer) -> dict[str, float | None]:
         truth, scan, material = self.case.truth, self.case.scan, robust_material_delta(self.case.truth)
         delta = _shaped(answer["volume"], truth.grid.shape) / (self._k() * scan.views.pixel_size)
         beta = _shaped(answer["beta"], delta.shape) if "beta" in answer else delta / self.case.ratio
@@ -294,11 +291,3 @@ def gradient(question: Question) -> np.ndarray:
     side = volume.shape[0]
     spread = footprints(question.angles, side).T @ lines.transpose(0, 2, 1).reshape(views * columns, rows)
     return spread.reshape(side, columns, rows).transpose(0, 2, 1)
-
-
-def chosen_tracks(wanted: Sequence[str], table: Mapping[Track, str] = TRACKS) -> list[Track]:
-    """The wanted tracks in the table's order, all if none is wanted."""
-    from ..run import chosen
-
-    names = chosen("--tracks", wanted, list(table))
-    return [track for track in table if track in names]

@@ -9,13 +9,13 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from holosplat.report.page import Headline
-from holosplat.report.style import CYCLE, FAINT, WIDTH, letter, new_figure, styled
+from holosplat.report.style import CYCLE, WIDTH, letter, new_figure, styled
 
 from ..arena.contest import TRACKS, Track
 from ..arena.history import Change, Entry, changes, mean, previous
 from .page import Entry as Cell
 from .page import Page, Picture, ScoreTable, Sheet, write_page
-from .plots import MARKERS, log_ticks, pareto_front
+from .plots import MARKERS, draw_front, log_ticks, pareto_front
 
 MEASURES = {
     "kernels": ("error", "adjoint"),
@@ -218,10 +218,8 @@ def pareto_figure(track: str, table: dict[str, dict[str, float]]) -> Figure:
         axes.plot(*point, ls="none", zorder=3, **style)
         handles.append(Line2D([], [], ls="none", label=name, **style))
         points.append(point)
-    xs, ys = zip(*points)
-    axes.set(xscale="log", yscale="log", xlim=(min(xs) / 1.6, max(xs) * 1.6), ylim=(min(ys) / 1.4, max(ys) * 1.4))
-    x, y = zip(*pareto_front(points))
-    axes.step([*x, 1.6 * max(xs)], [*y, y[-1]], where="post", color=FAINT, lw=0.8, zorder=1)
+    axes.set(xscale="log", yscale="log")
+    draw_front(axes, points, (1.6, 1.4), lw=0.8)
     axes.set(xlabel="processor time (s)", ylabel=CALLED[track, "error"])
     log_ticks(axes.xaxis)
     log_ticks(axes.yaxis)

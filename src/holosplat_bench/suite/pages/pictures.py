@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
 
 from holosplat.report.style import (
     DELTA_MAP,
@@ -16,6 +15,7 @@ from holosplat.report.style import (
     SIGNED_MAP,
     WIDTH,
     colour_bar,
+    grey_limits,
     image_panel,
     new_figure,
     scale_bar,
@@ -97,7 +97,11 @@ def slices_figure(truth: Arrays, shown: Sequence[Shown]) -> Figure:
             drawn = image_panel(panel, picture.arrays[plane].astype(np.float32), pitch, DELTA_MAP, limits)
             if picture.arrays is truth and plane == "xz":
                 scale_bar(panel, sizes[plane][0], height=0.08, beside=True)
-    _bar_tile(tiles, len(shown) + 1, drawn, "δ, the material's = 1")
+    panels = tiles.tile((len(shown) + 1), "", "")
+    for panel in panels:
+        panel.set_axis_off()
+    if drawn is not None:
+        colour_bar(tiles.figure, drawn, tiles.beside(panels[0], 0.02, 0.07, 0.94), "δ, the material's = 1", "both")
     return tiles.figure
 
 
@@ -108,8 +112,7 @@ def holograms_figure(truth: Arrays, shown: Sequence[Shown]) -> Figure:
     height, width = measured.shape
     pitch = (float(truth["pixel_size"]), float(truth["pixel_size"]))
     tiles = Tiles(len(shown) + 1, [height / width] * 2)
-    low, high = (float(v) for v in np.percentile(measured, [0.2, 99.8]))
-    limits = (low, high) if high > low else (low - 0.5, low + 0.5)
+    limits = grey_limits(measured)
     residuals = [picture.arrays["frame"].astype(np.float32) - measured for picture in shown]
     extremes = [float(np.percentile(np.abs(residual), 99.5)) for residual in residuals]
     limit = float(np.median(extremes)) or 1.0 if extremes else 1.0
@@ -126,15 +129,6 @@ def holograms_figure(truth: Arrays, shown: Sequence[Shown]) -> Figure:
     if signed is not None:
         colour_bar(tiles.figure, signed, tiles.beside(below, 0.54, 0.07, 0.94), "difference", "both")
     return tiles.figure
-
-
-def _bar_tile(tiles: Tiles, index: int, drawn: AxesImage | None, label: str) -> None:
-    """A colour bar in place of a tile."""
-    panels = tiles.tile(index, "", "")
-    for panel in panels:
-        panel.set_axis_off()
-    if drawn is not None:
-        colour_bar(tiles.figure, drawn, tiles.beside(panels[0], 0.02, 0.07, 0.94), label, "both")
 
 
 def _size(image: np.ndarray, across: float, down: float) -> tuple[float, float]:

@@ -122,10 +122,15 @@ def _tradeoff_panel(axes: Axes, shown: Sequence[MethodResult], marks: Marks, mea
             axes.plot(*points[-1], ls="none", zorder=3, clip_on=False, scalex=False, scaley=False, **style)
     if not points:
         return
-    xs, ys = zip(*points)
-    axes.set(xlim=(min(xs) / 1.5, max(xs) * 1.5), ylim=(min(ys) / 1.25, max(ys) * 1.25))
+    draw_front(axes, points, (1.5, 1.25), lw=0.7)
+
+
+def draw_front(axes: Axes, points: Sequence[tuple[float, float]], margins: tuple[float, float], lw: float) -> None:
+    """Steps along the front of `points`, on axes that reach beyond all of them by these factors."""
+    (wide, high), (xs, ys) = margins, zip(*points)
+    axes.set(xlim=(min(xs) / wide, max(xs) * wide), ylim=(min(ys) / high, max(ys) * high))
     x, y = zip(*pareto_front(points))
-    axes.step([*x, 1.5 * max(xs)], [*y, y[-1]], where="post", color=FAINT, lw=0.7, zorder=1)
+    axes.step([*x, wide * max(xs)], [*y, y[-1]], where="post", color=FAINT, lw=lw, zorder=1)
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:

@@ -6,11 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from holosplat.checks import require
 from holosplat.report.page import Headline, duration
 from holosplat.report.style import format_length, scientific
+from holosplat.units import span
 
 from ..folder import BenchFolder, Row
 from ..pictures import TRUTH
@@ -161,15 +163,10 @@ def case_facts(case: CaseResult) -> list[str]:
         *named,
         f"{_counted(facts['training_frames'], 'training frame')} and {facts['held_out_frames']} held out, {axis}, of "
         f"{rows} × {columns} pixels of {format_length(facts['pixel_size_m'])}, {facts['energy_kev']:g} keV, "
-        f"{_between([1e3 * z for z in facts['distance_m']])} mm behind the sample, point-spread function of "
-        f"{_between(facts['psf_sigma_px'])} pixels, {photons}. Methods are told {_prior(facts['prior'])}. "
+        f"{span(1e3 * np.array(facts['distance_m']))} mm behind the sample, point-spread function of "
+        f"{span(np.array(facts['psf_sigma_px']))} pixels, {photons}. Methods are told {_prior(facts['prior'])}. "
         f"Seed{'s' * (len(case.seeds) > 1)} {seeds}.",
     ]
-
-
-def _between(pair: Sequence[float]) -> str:
-    low, high = pair
-    return f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
 
 
 def _prior(prior: dict[str, Any]) -> str:
