@@ -24,6 +24,16 @@ from ..representations import Stored
 from ..units import format_length
 from .parts import COLOUR, HALF_EDGE, Frame, Shown, Splats, legend, shown
 
+
+def require_viser() -> Any:
+    """The package viser; `InputError` where it is not installed."""
+    try:
+        import viser
+    except ImportError:
+        raise InputError('The live view needs viser; install it by pip install "holosplat[view]".') from None
+    return viser
+
+
 LEGEND = (
     '<div style="margin: 0 1em; font-size: 0.85em"><div style="height: 0.8em; background: linear-gradient(to right, '
     '{colours})"></div>{said}</div>'
@@ -32,14 +42,14 @@ LEGEND = (
 
 
 class LiveView:
-    """A page in the browser that shows an object, a description, and sliders; port: the first that is tried. Errors:
-    `InputError` without the package viser, and for a version of it that could not be guarded."""
+    """A page in the browser that shows an object, a description, and sliders.
+
+    port: the first that is tried; the next free one is taken. Errors: `InputError` without the package viser, or for a
+    version of it that starts its server in another way, which could not be guarded.
+    """
 
     def __init__(self, title: str, port: int = 8080) -> None:
-        try:
-            import viser
-        except ImportError:
-            raise InputError('The live view needs viser; install it by pip install "holosplat[view]".') from None
+        viser = require_viser()
         logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # of connections that browsers break off
         self.guard = Guard(secrets.token_urlsafe(24))
         with _guarded(self.guard) as started, redirect_stdout(StringIO()):  # it prints addresses without the token
@@ -88,13 +98,7 @@ class LiveView:
                 "/object", self.frame.places(part.vertices), part.faces.astype(np.uint32), color=COLOUR, side="double"
             )
         else:
-            scene.add_gaussian_splats(
-                "/splats",
-                self.frame.places(part.centres),
-                part.covariances * self.frame.scale**2,
-                part.colours,
-                part.opacities[:, None],
-            )
+            self._show_splats(part)
         if self._part is not None and self._part is not type(part):
             scene.remove_by_name("/splats" if self._part is Splats else "/object")
         self._part = type(part)
@@ -113,6 +117,16 @@ class LiveView:
         self._server.scene.add_line_segments("/scale", bars.astype(np.float32), (255, 255, 255), thickness=0.08)
         for axis, said, end in zip("xyz", (f"x, {format_length(self.frame.bar)}", "−y", "z"), ends):
             self._server.scene.add_label(f"/scale/{axis}", said, position=end)
+
+    def _show_splats(self, part: Splats) -> None:
+        assert self.frame is not None
+        self._server.scene.add_gaussian_splats(
+            "/splats",
+            self.frame.places(part.centres),
+            part.covariances * self.frame.scale**2,
+            part.colours,
+            part.opacities[:, None],
+        )
 
     def slider(self, label: str, steps: int, on_step: Any, first: int = 0) -> None:
         """A slider from 0 to `steps` - 1; `on_step(k)` is called when it is moved."""
