@@ -26,7 +26,7 @@ from .auto import Auto
 from .continued import Continued
 from .contrast import STAGE as SIGN
 from .contrast import Scoring, decide_sides, decide_sign, with_sign
-from .cross_validation import BY_FISSION, FirstVolumes, assumed_material, plain_light, predicted_frames
+from .cross_validation import BY_FISSION, EFFORT, FirstVolumes, assumed_material, plain_light, predicted_frames
 from .levels import SHOWN, TrialFits, at_decided, blind, decide_ratio
 from .method import Method, Task, first_of_task, one_material
 from .trials import UNEVEN, WITHOUT, Hypothesis, Trials, name_of, named, rivals, with_more
@@ -93,7 +93,7 @@ def confirmed(task: Task, first: FirstVolumes, told: Hypothesis) -> Decision:
     for light. A fit through the waves, in units of the noise, leaves less. That there is a gain, first volumes have
     shown in every fold; by fits to one of them it must be of practical size.
     """
-    fits = TrialFits(task, first, {"continuous": SmoothVolume()})
+    fits = TrialFits(task, first, {"continuous": SmoothVolume(rounds=1).with_effort(EFFORT)})
     counts = range(len(told), len(first.taken))
     candidates = [name_of(first.taken[:count]) for count in (*counts, len(first.taken))]
     beside = {name_of(first.taken[: n + 1]): rivals(first.taken[:n], first.taken[n]) for n in counts}
@@ -160,7 +160,7 @@ def prepared(task: Task, method: Method | None = None, before: Prepared | None =
                 first.taken, made = decided(first, options, told, open_to)
         shown = None if method is None or method.of_series or not made else shows_matter(first, options, first.taken)
         if isinstance(method, Auto) and shown is not None and blind([shown]):
-            kinds = method.kinds
+            kinds = method.with_effort(EFFORT).kinds
             alone: dict[MatterKind, Method] = {"continuous": kinds["continuous"]}
             scored = by_fits(task, first, alone if task.prior.two_sided else kinds)
             first.taken, again = decided(first, options, told, open_to, scored)

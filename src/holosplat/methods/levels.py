@@ -27,7 +27,6 @@ from .cross_validation import BY_FISSION, EFFORT, FirstVolumes, predictions, wit
 from .method import Method, Task, first_of_task, solve_stages
 from .trials import WITHOUT, Hypothesis, Trial, Trials, accepted, hypothesis_of, name_of
 from .uncertain import Determined, likeliest_ratio
-from .volume import SmoothVolume
 
 STAGE = "levels or continuous matter"
 SHOWN = "matter in first volumes"
@@ -70,7 +69,7 @@ def decide_matter(task: Task, methods: Mapping[MatterKind, Method] | None = None
         if methods is None or sure:
             return found
     for effort in (EFFORT, 1.0):
-        fits = TrialFits(task, first, methods, effort)
+        fits = TrialFits(task, first, {kind: method.with_effort(effort) for kind, method in methods.items()})
 
         def scored(name: str, fold: int, fits: TrialFits = fits) -> Score:
             return fits.score(name_of(first.taken), kind_of(name), fold, two=name == LEVELS[1])
@@ -117,22 +116,13 @@ class _FlatVolumes:
 class TrialFits:
     """Fits of the methods for either kind of matter to coarse frames, under hypotheses about light and noise.
 
-    They start from volumes on voxels of a pixel, as first ones are. Bodies take a part `effort` of their steps, and
-    smooth volumes all those of one round: after a fifth of them, what is left to be found passes for light. Two levels
-    alone need no ratio δ/β; else it is, where nothing is known, the likeliest one, as in a run; before light is
-    decided, that of the first volume.
+    They start from volumes on voxels of a pixel, as first ones are. Two levels alone need no ratio δ/β; else it is,
+    where nothing is known, the likeliest one, as in a run; before light is decided, that of the first volume.
     """
 
-    def __init__(
-        self, task: Task, first: FirstVolumes, methods: Mapping[MatterKind, Method], effort: float = EFFORT
-    ) -> None:
+    def __init__(self, task: Task, first: FirstVolumes, methods: Mapping[MatterKind, Method]) -> None:
         self._task, self._first = task, first
-
-        def brief(method: Method) -> Method:
-            one = replace(method, rounds=1) if isinstance(method, SmoothVolume) else method.with_effort(effort)
-            return with_entries(one, {"refine": 1})
-
-        self._methods = {kind: brief(method) for kind, method in methods.items()}
+        self._methods = {kind: with_entries(method, {"refine": 1}) for kind, method in methods.items()}
         self._trials = Trials(first, task.light)
 
     def score(self, name: str, kind: MatterKind, fold: int, two: bool = False) -> Score:

@@ -249,8 +249,7 @@ def of_choice(sizes: Sizes, method: Auto) -> float:
     if sizes.views < FEWEST:
         return 0.0
     coarse, folds = _coarse(sizes), MOST if sizes.views >= MANY else sizes.views
-    brief = replace(method.with_effort(EFFORT), volume=replace(method.volume, rounds=1))
-    each = [of_fit(coarse, brief, kind) for kind in KINDS]
+    each = [of_fit(coarse, method.with_effort(EFFORT), kind) for kind in KINDS]
     return folds * sum(max(one.seconds, one.most_seconds) - Costs.beside for one in each if one is not None)
 
 
