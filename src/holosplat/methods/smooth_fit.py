@@ -115,9 +115,8 @@ class SmoothPlan:
         return (*coarse, *trials, *(Leg(1, self.iterations) for _ in range(self.rounds)))
 
     def frames(self, factor: int) -> WhitenedFrames:
-        """The frames on pixels `factor` times larger, in units of their noise; their waves on samples as fine, for the
-        phase behind strong matter is as steep (the error of soft cells is .15 so, and .19 with two samples a pixel)."""
-        scan = self.scan.binned(factor)
+        """The frames on pixels `factor` times larger, in units of their noise; their waves on samples as fine."""
+        scan = self.scan.binned(factor)  # the phase behind strong matter is as steep
         samples = min(fringe_sampling(scan.exposures), factor * fringe_sampling(self.scan.exposures, voxels=1))
         noise, material = self.noise.binned(factor), self.begun.matter.channels[0]
         light = self.light and self.light.part(torch.arange(len(self.scan)), factor)
