@@ -9,11 +9,14 @@ import torch
 from holosplat.beamline.simulate import simulate
 from holosplat.geometry import Grid, Views
 from holosplat.materials import parse_material
-from holosplat.matter import Matter
+from holosplat.matter import MaterialPrior, Matter
 from holosplat.methods.cross_validation import predicted_frames
+from holosplat.methods.method import Task
+from holosplat.methods.smooth_fit import SmoothFit
+from holosplat.methods.volume import SmoothStage, SmoothVolume
 from holosplat.optics.sampling import fringe_sampling
 from holosplat.representations import VoxelGrid
-from holosplat.scan import Exposures
+from holosplat.scan import Exposures, Scan
 from holosplat.specimens.phantoms import packed_balls
 from holosplat.specimens.scene import MeshScene
 
@@ -37,3 +40,16 @@ def test_true_voxels_of_sharp_matter_predict_frames_better_with_two_samples_a_pi
     assert fringe_sampling(exposures) == 4
     assert missed(0) == missed(2)
     assert missed(2) < 0.9 * missed(4)
+
+
+def test_waves_behind_larger_voxels_have_samples_as_fine_as_behind_those_of_a_pixel():
+    """Two a pixel of 5 µm are four a pixel of 10 µm, where fringes of sharp matter ask for seven."""
+    exposures = Exposures.of(Views.evenly_spaced(3, (31, 42), 5e-6), 20.0, 0.1)
+    frames = np.random.default_rng(0).normal(1, 0.01, (3, 31, 42)).astype(np.float32)
+    scan = Scan(frames, exposures, np.zeros(3, dtype=bool))
+    grid = Grid.of_views(exposures.views)
+    start = VoxelGrid(torch.zeros(1, *grid.shape), grid, Matter.one(1e-7, 1e-10))
+    fit = SmoothStage(SmoothVolume()).fit(Task(scan, MaterialPrior.of_ratio(1000.0)), start)
+    assert isinstance(fit, SmoothFit)
+    assert fringe_sampling(scan.binned(2).exposures) == 7
+    assert [fit.plan.frames(factor).instrument.oversample for factor in (1, 2)] == [2, 4]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,7 +80,7 @@ def ground(
     """
     train, aside = split_validation(scan.train(), schedule.validation_views)
     require(np.ptp(train.frames) > 0, "all training frames are constant, so there is nothing to fit.")
-    oversample = schedule.oversample or max(finer, fringe_sampling(train.exposures, voxels=finer or math.inf))
+    oversample = schedule.oversample or max(finer, fringe_sampling(train.exposures))
     instrument = Instrument(train.exposures, oversample, backend=backend)
     frames = FrameTerm(train, instrument, objective, matter, schedule.detach_worst)
     judge = None

@@ -28,8 +28,7 @@ DAMPED, EASED, MOST_DAMPED = 1e-3, 10.0, 1e6
 """Damping at first, as a share of each second derivative; the factor by which it falls after a step that helped and
 grows after one that did not; and the one at which the fit ends, for then no step helps."""
 WORTH = 0.5
-"""Gain of the log-likelihood below which a step is the last: by so much one of the unknowns moves it on average. χ² a
-pixel above one, as of matter that is no sphere, stands for the noise: the gain is so many times larger then."""
+"""Gain of the log-likelihood below which a step is the last: by so much one of the unknowns moves it on average."""
 MOST = 30
 """Steps at most; Gauss and Newton's take about eight."""
 
@@ -122,11 +121,10 @@ class Sphere:
             self.damping *= 1 / EASED if value < self.value else EASED
             if value < self.value:
                 gained, self.unknowns, self.value, self.done = self.value - value, tried, value, self.done + 1
-        last = gained < WORTH * max(1.0, 2 * self.value / self.problem.frames.count)
-        if last and not self.cut:
+        if gained < WORTH and not self.cut:
             self._cut(matrix + LEAST * diagonal, self.unknowns / level)
         else:
-            self.ended = last or self.done >= MOST
+            self.ended = gained < WORTH or self.done >= MOST
 
     def errors(self) -> tuple[float, Tensor]:
         """Standard error of the sum of the volume, and covariance of the unknowns, of which no value is unknown beyond
