@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from holosplat.checks import InputError
-from holosplat.cli.convert import OneMaterial
+from holosplat.cli.convert import RatioOptions
 from holosplat.cli.options import BeamlineOptions, MaterialOptions
 from holosplat.geometry import Views
 from holosplat.io.formats import loader_of, read, read_as
@@ -115,8 +115,8 @@ def test_no_formula_speaks_of_light():
 
 def test_cells_in_light_are_retrieved_below_the_medium():
     """Their δ is negative, so that their phase is positive."""
-    below, _ = OneMaterial(delta_beta=1e5, contrast="below").at(LIGHT)
+    below, _ = RatioOptions(delta_beta=1e5, contrast="below").at(LIGHT)
     assert below.delta < 0
     assert below.delta / below.beta == pytest.approx(1e5)
     with pytest.raises(InputError, match="--contrast goes with --delta-beta"):
-        OneMaterial(material="water", contrast="below").at(20.0)
+        RatioOptions(material="water", contrast="below").at(20.0)
