@@ -34,6 +34,7 @@ from ..scan import Scan
 from ..tables import with_entries
 from ..workflows.evaluate import TIMES, Evaluation, score_object, write_times
 from ..workflows.evaluate import evaluate as score
+from ..workflows.forecast import read_forecast
 from ..workflows.motion_choice import may_flow
 from ..workflows.provenance import scan_hash
 from ..workflows.reconstruct import load_reconstruction
@@ -123,6 +124,7 @@ def track(
     resume: bool = False,
     reading: Reading = Reading(),
     *,
+    after: Path | None = None,
     illumination: LightFlags = LightFlags(),
     known: BodyFlags = BodyFlags(),
 ) -> None:
@@ -134,16 +136,19 @@ def track(
             writes.
         seed: Seed of everything random.
         resume: Go on with an interrupted run; --resume RUN alone, with its scan and options.
+        after: Folder that holosplat forecast wrote, of an earlier run that reaches over these times: its bodies are
+            the start, and its standard errors the prior.
     """
     require(
         reading.part.time_frame is None,
         f"bodies are followed through all times, but --time-frame is {reading.part.time_frame}; leave it.",
     )
     options, folder = replace(how.options(), body=known.known()), RunFolder(out)
+    before = None if after is None else read_forecast(RunFolder(after))
     measured = read_frames(scan, reading)
     tell_frames("track", measured.exposures[~measured.is_test], out, lambda seen: of_track(seen, options))
     measured = measured.in_memory()
-    if options.body is None and len(beam_directions(measured.train().views)) == 2:
+    if before is None and options.body is None and len(beam_directions(measured.train().views)) == 2:
         say(
             "note: two beams leave the shapes of bodies open; where their shape at rest is known, --body red-cell or "
             "--body FILE helps."
@@ -151,6 +156,7 @@ def track(
     prior = matter.prior(measured.exposures.reference_energy, reading.told.wall)
     with interruptible(lambda: _cut_off(folder)), ProgressBar() as bar:
         told = {"light": illumination.options(), "folder": folder, "resume": resume, "on_progress": bar.show}
+        told |= {"after": before}
         result = follow(measured, prior, options, seed, **told)
     with claimed(folder):
         evaluation = _scored(folder, result, measured, scan, reading)

@@ -56,6 +56,9 @@ class CoarseToFine:
     turn_gain: Share = 0.002
     """Part of the residual's square that a turn must take away for another one: turns that left the matter as it was
     took 0.0005 at most, those that helped 0.005 or more (looked at once)."""
+    join_missing: bool = True
+    """Whether bodies that surfaces of small frames lack are looked for, and join them where they predict unseen frames
+    better."""
     coarse_steps: int = 40
     """Steps of the coarse surfaces."""
     finer_steps: int = 40

@@ -69,7 +69,8 @@ def decide_matter(task: Task, methods: Mapping[MatterKind, Method] | None = None
         if methods is None or sure:
             return found
     for effort in (EFFORT, 1.0):
-        fits = TrialFits(task, first, {kind: method.with_effort(effort) for kind, method in methods.items()})
+        kinds = {kind: method.with_effort(effort) for kind, method in methods.items()}
+        fits = TrialFits(task, first, kinds, whole=effort == 1.0)
 
         def scored(name: str, fold: int, fits: TrialFits = fits) -> Score:
             return fits.score(name_of(first.taken), kind_of(name), fold, two=name == LEVELS[1])
@@ -117,12 +118,16 @@ class TrialFits:
     """Fits of the methods for either kind of matter to coarse frames, under hypotheses about light and noise.
 
     They start from volumes on voxels of a pixel, as first ones are. Two levels alone need no ratio δ/β; else it is,
-    where nothing is known, the likeliest one, as in a run; before light is decided, that of the first volume.
+    where nothing is known, the likeliest one, as in a run; before light is decided, that of the first volume. whole:
+    whether bodies that surfaces lack join them; without these bodies predict unseen frames no better, and cost half.
     """
 
-    def __init__(self, task: Task, first: FirstVolumes, methods: Mapping[MatterKind, Method]) -> None:
+    def __init__(
+        self, task: Task, first: FirstVolumes, methods: Mapping[MatterKind, Method], whole: bool = False
+    ) -> None:
         self._task, self._first = task, first
-        self._methods = {kind: with_entries(method, {"refine": 1}) for kind, method in methods.items()}
+        how = {"refine": 1, "join_missing": whole}
+        self._methods = {kind: with_entries(method, how) for kind, method in methods.items()}
         self._trials = Trials(first, task.light)
 
     def score(self, name: str, kind: MatterKind, fold: int, two: bool = False) -> Score:

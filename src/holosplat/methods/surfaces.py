@@ -117,7 +117,7 @@ class BodiesStage(GaussianStage):
             if not found:
                 raise
             return found["of a volume"]
-        lacking, small = bool(found) or self._missing(first, task) > most, self._small(task)
+        lacking, small = bool(found) or self._missing(first, task) > most, self._small(task) and how.join_missing
         if not (lacking or small):
             return first
         own = settled(seen, first, self.surfaces, steps)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -34,6 +35,7 @@ from .detections import (
     without_merger,
 )
 from .elastic import Rest
+from .expected import Expected
 from .fit import MotionFit, chosen_paths, motion_fit
 from .known import KnownBodies, Trials, at_rest, chosen_twins
 from .measures import astray, halves_of, tell_shapes
@@ -51,7 +53,8 @@ class Followed:
     in these; timing: seconds of each stage; found: how many bodies each time shows by itself; halves: the bodies by
     halves of the frames, two and two, empty without intervals; rest: their shape at rest [m], if that is known; begun:
     the detection method at single times, in words; body: their known shape, given or found; decisions: on detections,
-    pieces of paths, twins, and the kind of bodies."""
+    pieces of paths, twins, and the kind of bodies; moved: how far frames moved surfaces from a forecast, in the
+    standard errors of that, NaN without one."""
 
     bodies: MovingSurfaces
     records: list[Record]
@@ -63,6 +66,7 @@ class Followed:
     begun: str = ""
     body: KnownBody | None = None
     decisions: tuple[Decision, ...] = ()
+    moved: float = math.nan
 
 
 @dataclass
@@ -77,6 +81,8 @@ class BodyTracker:
     light: Light | None
     run: Run
     on_progress: FitProgress
+    expected: Expected | None = None
+    """Where a forecast has the first bodies, which stay."""
     stage: str = "sightings"
     round: int = 0
     bodies: MovingSurfaces | None = None
@@ -132,12 +138,20 @@ class BodyTracker:
         """The tracked bodies; said: a sentence on their kind."""
         assert self.bodies is not None
         told = self.records, self.oversample, self.run.timing, tuple(self.counts), tuple(self.halves)
+        moved = math.nan if self.expected is None else self.expected.deviation(self.bodies)
+        if self.expected is not None:
+            said += f"; frames moved surfaces by {moved:.2g} standard errors of the forecast (rms)"
         guess, made = self.guess + said, tuple(self.decisions)
-        return Followed(self.bodies, *told, self.shape_at_rest(), guess, self.options.body, made)
+        return Followed(self.bodies, *told, self.shape_at_rest(), guess, self.options.body, made, moved)
 
     def advance(self) -> None:
         """Do the stage that is next."""
-        if self.stage == "sightings":
+        if self.expected is not None and self.stage in STAGES[:2]:
+            start = self.expected.on(self.basis)
+            self.bodies = self.fitted("correction", self.train, start, self.options.soft, self.light)
+            self.counts = [start.count] * len(self.train.instants)
+            self.guess, self.stage = "a forecast", "beside" if self.options.rounds else "paths"
+        elif self.stage == "sightings":
             network = self.network()
             self.seen = [] if self.options.body and not network else self.look(self.train, network=network)
             self.counts, self.stage = [len(one) for one in self.seen], "first paths"
@@ -156,7 +170,7 @@ class BodyTracker:
         """The stages after the first paths."""
         if self.stage == "stiff":
             whole = self.whole(self.fitted("stiff fit", self.train, bodies, self.options.stiff, self.light))
-            self.bodies = without_merger(whole, self.train.instants)
+            self.bodies = self.kept(whole, without_merger(whole, self.train.instants))
             after = "beside" if self.round < self.options.rounds else "paths"
             self.stage = after if self.bodies is whole else "stiff"
         elif self.stage == "beside":
@@ -186,7 +200,8 @@ class BodyTracker:
             told = tell_shapes(self.train)
             bodies = bodies if told else astray(bodies, self.seed, side)
             how = self.options.half if told or self.options.body else self.options.soft
-            self.halves.append(self.fitted("intervals", self.train[part], bodies, how, light))
+            expected = self.expected and self.expected.astray(self.seed, side)
+            self.halves.append(self.fitted("intervals", self.train[part], bodies, how, light, expected))
         if len(self.halves) == len(parts):
             self.stage = "done"
 
@@ -222,8 +237,7 @@ class BodyTracker:
 
     def first(self) -> MovingSurfaces:
         """Bodies on first paths; the doubtful ones are left to be found beside the others."""
-        times, options = self.train.instants, self.options
-        basis = TimeBasis(float(times[0]), float(times[-1]), options.paths.degree)
+        times, options, basis = self.train.instants, self.options, self.basis
         if options.body is not None:
             begun = None
             with suppress(InputError):  # no track
@@ -239,6 +253,12 @@ class BodyTracker:
         assert found is not None
         sure = sure_ones(found, self.train.views, times)
         return found if options.rounds == 0 or len(sure) == found.count else only(found, sure)
+
+    @property
+    def basis(self) -> TimeBasis:
+        """Of paths of one piece."""
+        times = self.train.instants
+        return TimeBasis(float(times[0]), float(times[-1]), self.options.paths.degree)
 
     def _detect(self, basis: TimeBasis) -> MovingSurfaces | None:
         """The bodies of single times on first paths; None where none were looked for."""
@@ -295,8 +315,13 @@ class BodyTracker:
 
     def whole(self, bodies: MovingSurfaces) -> MovingSurfaces:
         """`bodies` without pieces of others."""
-        kept = whole_ones(bodies, self.train.instants)
-        return bodies if len(kept) == bodies.count else only(bodies, kept)
+        return self.kept(bodies, whole_ones(bodies, self.train.instants))
+
+    def kept(self, bodies: MovingSurfaces, numbers: list[int]) -> MovingSurfaces:
+        """The `bodies` of these numbers, and those that a forecast has."""
+        known = range(0 if self.expected is None else self.expected.count)
+        both = sorted({*known, *numbers})
+        return bodies if len(both) == bodies.count else only(bodies, both)
 
     def told_from_twins(self, bodies: MovingSurfaces) -> MovingSurfaces:
         """`bodies` of known rest shape, or their twins, where there are two beams."""
@@ -313,7 +338,7 @@ class BodyTracker:
         how = (self.options.paths, self.options.stiff, self.seed, self.light, self.rest)
         self.on_progress("paths", 0.0, {})
         with self.run.timed("paths"):
-            found = chosen_paths(self.train, bodies, *how, run=self.run)
+            found = chosen_paths(self.train, bodies, *how, expected=self.expected, run=self.run)
         return self._decided(*found)
 
     def _decided(self, bodies: MovingSurfaces, decision: Decision | None) -> MovingSurfaces:
@@ -322,10 +347,17 @@ class BodyTracker:
         return bodies
 
     def fitted(
-        self, name: str, frames: Scan, start: MovingSurfaces, how: MotionFit, light: Light | None
+        self,
+        name: str,
+        frames: Scan,
+        start: MovingSurfaces,
+        how: MotionFit,
+        light: Light | None,
+        expected: Expected | None = None,
     ) -> MovingSurfaces:
-        """`start` after a fit to `frames`, from where an earlier run was cut off in it."""
-        fit = motion_fit(frames, start, how, self.seed, light, self.rest)
+        """`start` after a fit to `frames`, from where an earlier run was cut off in it; expected: in place of the
+        forecast, of a part of the frames."""
+        fit = motion_fit(frames, start, how, self.seed, light, self.rest, expected=expected or self.expected)
 
         def show(record: Record) -> None:
             self.records.append(record | {"step": len(self.records) + 1})

@@ -256,8 +256,9 @@ VOXELS = 20_000
 """Of the grid on which a body and those in it are compared, at most."""
 
 
-def without_merger(bodies: MovingSurfaces, times: np.ndarray) -> MovingSurfaces:
-    """`bodies` without the one that lies in others most, if that is a merger: most of it is in two others or more.
+def without_merger(bodies: MovingSurfaces, times: np.ndarray) -> list[int]:
+    """Numbers of the bodies without the one that lies in others most, if that is a merger: most of it is in two others
+    or more.
 
     Few beams show two bodies that touch as one between them. Each is then found beside it, in the shadow that it
     leaves, and none of the three can become what it is as long as the merger takes the middle.
@@ -267,7 +268,7 @@ def without_merger(bodies: MovingSurfaces, times: np.ndarray) -> MovingSurfaces:
     shares[shares < LEAST] = 0
     merged = np.where((shares > 0).sum(1) >= 2, shares.sum(1), 0.0)
     worst = int(merged.argmax())
-    return bodies if merged[worst] < MOST else only(bodies, [k for k in range(bodies.count) if k != worst])
+    return [k for k in range(bodies.count) if k != worst or merged[k] < MOST]
 
 
 def shared(bodies: MovingSurfaces, time: float) -> np.ndarray:

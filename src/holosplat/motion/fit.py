@@ -30,6 +30,7 @@ from ..representations.isosurface import adjacency
 from ..scan import Scan
 from .detections import predicted
 from .elastic import COEFFICIENTS, Acceleration, Apart, MovingBending, Rest, RestShapeKept, area_kept, volume_kept
+from .expected import Expected, NearExpected
 
 OPEN = 1e-3
 """Share of the times' mean square below which a coefficient is taken to be seen so well: what frames hardly see of a
@@ -80,10 +81,12 @@ def motion_fit(
     seed: int = 0,
     light: Light | None = None,
     rest: Rest | None = None,
+    *,
+    expected: Expected | None = None,
 ) -> Fit:
     """Prepare the fit of the paths of `start` to the training frames of `scan`, of any number of times.
 
-    rest: the known shape of bodies at rest.
+    rest: the known shape of bodies at rest; expected: where a forecast has the first of the bodies.
 
     Steps are Adam's, of one length for all vertices, or those of L-BFGS, in coordinates in which neighbours move
     together (Nicolet et al. 2021) and in which times count alike: the paths' Gram matrix over the times is one.
@@ -102,8 +105,9 @@ def motion_fit(
             return QuasiNewton(leaves, smooth, options.pairs, worth)
         return Adam(leaves, "cpu", {COEFFICIENTS: group})
 
+    prior = (*_at_rest(base, start, rest), *_near(base, start, expected))
     plan = Plan(
-        problem=Problem(base.model, (base.frames, *_terms(base, start, options), *_at_rest(base, start, rest))),
+        problem=Problem(base.model, (base.frames, *_terms(base, start, options), *prior)),
         schedule=schedule,
         optimiser=optimiser,
         rates=lambda factor, step: {COEFFICIENTS: options.rate * factor},
@@ -143,6 +147,13 @@ def _at_rest(base: Ground, start: MovingSurfaces, rest: Rest | None) -> list[Ter
     if rest is None or rest.stiffness == 0:
         return []
     return [RestShapeKept(rest.stiffness * _of_likelihood(base) * start.basis.count, rest.elastic, start)]
+
+
+def _near(base: Ground, start: MovingSurfaces, expected: Expected | None) -> list[Term]:
+    """The prior of a forecast, whose errors count as one number a body and coefficient of time."""
+    if expected is None:
+        return []
+    return [NearExpected(_of_likelihood(base) * start.basis.count / 2, expected, start.basis)]
 
 
 def _of_likelihood(base: Ground) -> float:
@@ -208,6 +219,7 @@ def chosen_paths(
     light: Light | None = None,
     rest: Rest | None = None,
     *,
+    expected: Expected | None = None,
     run: Run | None = None,
 ) -> tuple[MovingSurfaces, Decision | None]:
     """`start` on paths of the asked number of pieces, or of the number that predicts held-out frames best; and the
@@ -232,7 +244,7 @@ def chosen_paths(
 
     def tried(bodies: MovingSurfaces) -> tuple[torch.Tensor, torch.Tensor]:
         part = light and light.part(torch.from_numpy(np.flatnonzero(~aside)))
-        fit = motion_fit(kept, bodies, short, seed, part, rest)
+        fit = motion_fit(kept, bodies, short, seed, part, rest, expected=expected)
         found = fitted_bodies(fit)
         missed = Score.of(torch.from_numpy(predicted(left, found, fit.oversample) - left.frames)).powers
         # one block a frame: frames differ by more than their parts do

@@ -22,6 +22,7 @@ from ..optics.background import Light
 from ..representations import MovingSurfaces, TimeBasis
 from ..scan import Exposures, Scan
 from .elastic import Rest
+from .expected import second_order_field
 from .fit import MotionFit, converged, motion_fit
 from .forecast import Halves, early_count, on_paths, places_of
 
@@ -159,9 +160,8 @@ def tell_shapes(train: Scan) -> bool:
 def astray(bodies: MovingSurfaces, seed: int, side: int) -> MovingSurfaces:
     """Each of `bodies` displaced by a random smooth field, of second order in the place; the other way for side -1.
 
-    About the middle of a body of radius r (root mean square), a place x is moved by r · ASTRAY · (A ξ + B ξ ξ) with
-    ξ = x/r, at all times alike; a number of A and B is drawn from a normal distribution, such that the mean square of
-    either term is one where ξ is of length one.
+    About the middle of a body of radius r (root mean square), a place x is moved by r · ASTRAY times the field at x/r,
+    at all times alike.
     """
     draws, moved = np.random.default_rng([seed, 1]), bodies.coefficients.detach().clone()
     for number in range(bodies.count):
@@ -169,9 +169,8 @@ def astray(bodies: MovingSurfaces, seed: int, side: int) -> MovingSurfaces:
         shape = moved[:, own].mean(0)
         shape = shape - shape.mean(0)
         radius = float(shape.square().sum(1).mean().sqrt())
-        first, second = (torch.from_numpy(draws.normal(size=size)) / 3**0.5 for size in ((3, 3), (3, 3, 3)))
-        xi = shape / radius
-        moved[:, own] += side * ASTRAY * radius * (xi @ first.T + torch.einsum("ijk,pj,pk->pi", second, xi, xi))
+        field = second_order_field(draws)((shape / radius).numpy())
+        moved[:, own] += side * ASTRAY * radius * torch.from_numpy(field)
     return bodies.with_parameters({"coefficients": moved})
 
 

@@ -8,15 +8,17 @@ import torch
 
 from ..bodies.poses import two_beams
 from ..bodies.rest_shape import KnownBody, guessed_cells
-from ..checks import InputError
+from ..checks import InputError, require
 from ..fit.run import Journal, Run
 from ..inference import Score, select
-from ..matter import DeltaBeta
+from ..matter import DeltaBeta, Matter
 from ..optics.background import Light
 from ..progress import FitProgress
 from ..scan import Scan
 from .body_tracker import BodyTracker, Followed, require_times
 from .detections import predicted
+from .expected import Expected
+from .forecast import Forecast
 from .track_linking import TrackOptions
 
 NAME, CELLS, ANY = "shape of the bodies", "red cells", "any shape"
@@ -62,16 +64,19 @@ def follow(
     seed: int = 0,
     *,
     light: Light | None = None,
+    after: Forecast | None = None,
     journal: Journal | None = None,
     on_progress: FitProgress = lambda stage, fraction, record: None,
 ) -> Followed:
     """The bodies of `material` in the training frames of `scan`, of several times.
 
-    light: of the training frames, which were divided by it, where it is uneven. journal: keeps every stage that is
-    done, and fits from time to time; what it holds already is not done again, and the result is the same bit for bit.
-    Where all frames are of two beams, of unknown shape, and a network of red cells guesses the bodies, they are
-    followed as red cells, too; these are kept unless bodies of any shape leave less (`compared_kinds`). Errors:
-    `InputError` for a scan of one time, and where no body is seen.
+    after: the forecast of these times by earlier ones, with which the bodies begin, and from which frames draw them as
+    far as its standard errors allow; light: of the training frames, which were divided by it, where it is uneven.
+    journal: keeps every stage that is done, and fits from time to time; what it holds already is not done again, and
+    the result is the same bit for bit. Where all frames are of two beams, of unknown shape, and a network of red cells
+    guesses the bodies, they are followed as red cells, too; these are kept unless bodies of any shape leave less
+    (`compared_kinds`). Errors: `InputError` for a scan of one time, where no body is seen, and for a forecast that does
+    not reach over the times, has no standard errors, or is given beside a shape at rest.
     """
     train = scan.train()
     require_times(train)
@@ -79,10 +84,17 @@ def follow(
 
     def tracker(name: str, body: KnownBody | None) -> BodyTracker:
         how = replace(options, body=body)
-        return BodyTracker(train, material, how, seed, light, run.part(name), on_progress)
+        return BodyTracker(train, material, how, seed, light, run.part(name), on_progress, expected)
 
+    require(
+        after is None or options.body is None,
+        "the shape at rest must not be given beside a forecast, which has the shapes, but both are; leave --body, or "
+        "--after.",
+    )
+    pixel, matter = train.views.finest, Matter.one(*material)
+    expected = after and Expected.of(after, train.instants, pixel, matter)
     every = tracker("any", options.body)
-    if options.body is None and options.cells and two_beams(train.views) is not None:
+    if expected is None and options.body is None and options.cells and two_beams(train.views) is not None:
         every.until("first paths")
         if every.cells > 0:
             return compared_kinds(tracker("cells", guessed_cells(every.cells)), every)

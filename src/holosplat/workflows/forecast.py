@@ -31,6 +31,7 @@ from ..scan import Scan
 from ..tables import read_rows, to_table
 from .evaluate import render_object
 from .provenance import RUN, scan_hash
+from .reconstruct import load_reconstruction
 from .reconstruction import Reconstruction, summary_of
 from .run_folder import RunFolder
 from .run_illumination import light_of
@@ -248,6 +249,16 @@ def read_band(folder: RunFolder) -> tuple[np.ndarray, np.ndarray]:
         times = np.array(list(dict.fromkeys(float(row["time_s"]) for row in rows)))
         band = np.array([float(row["standard_error_m"]) for row in rows]).reshape(len(times), -1)
     return times, band
+
+
+def read_forecast(folder: RunFolder) -> Forecast:
+    """The forecast in `folder`, without the numbers found on the way. Errors: `InputError` for another run."""
+    require(
+        (folder.path / TABLE).is_file(),
+        f"a forecast must be a folder that holosplat forecast wrote, but {folder.path} holds no {TABLE}; forecast a "
+        "run of track first.",
+    )
+    return Forecast(tracked_bodies(load_reconstruction(folder)), *read_band(folder))
 
 
 def config_of(options: ForecastOptions, scan: Scan, run: dict[str, Any], seed: int) -> dict[str, Any]:

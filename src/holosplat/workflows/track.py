@@ -3,6 +3,7 @@ flow carries (`reconstruct_moving`)."""
 
 from __future__ import annotations
 
+import hashlib
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -23,6 +24,7 @@ from ..methods.method import one_material
 from ..motion.body_tracker import Followed, require_times
 from ..motion.elastic import Rest, strain_energy
 from ..motion.flow_reconstruction import FlowOptions, FlowResult, FlowSearch, merged
+from ..motion.forecast import Forecast
 from ..motion.measures import columns, measured, row, standard_errors
 from ..motion.track import USUAL, follow
 from ..motion.track_linking import TrackOptions
@@ -57,6 +59,7 @@ def track(
     seed: int = 0,
     *,
     light: LightOptions | None = None,
+    after: Forecast | None = None,
     folder: RunFolder | None = None,
     resume: bool = False,
     on_progress: FitProgress = lambda stage, fraction, record: None,
@@ -64,6 +67,8 @@ def track(
     """Reconstruct closed bodies of one material that move through the training frames of `scan`, of several times.
 
     light: assumptions about the light (default: even, unless air shows otherwise)
+    after: forecast of these times by earlier ones, as the prior of the paths (a filter over windows of time); its
+        bodies stay, and others are looked for beside them
     folder: where to write what `reconstruct` writes, and `bodies.pvd` with one VTK file (.vtp, µm) a body and time, and
         `tracks.csv`; a later call with `resume=True` continues from the last checkpoint, with the same result
 
@@ -102,13 +107,16 @@ def track(
     check_frames(scan.train())
     assumed = light or LightOptions()
     config = config_of(scan, prior, options, seed, "levels", assumed)
+    config |= {} if after is None else {"after": _hash(after)}
     with claimed(folder):
         if folder is not None and not goes_on(folder, config, resume):
             folder.begin(config | environment("cpu"))
         task = prepared(Task(scan.train(), prior, seed, lambda stage, part: on_progress(stage, part, {}), assumed))
         train = task.scan
         material = assumed_material(train.at_instant(0), one_material(task), task.on_progress)
-        found = follow(train, material, options, seed, light=task.uneven, journal=folder, on_progress=on_progress)
+        found = follow(
+            train, material, options, seed, light=task.uneven, after=after, journal=folder, on_progress=on_progress
+        )
         choice = Choice("levels", {}, "soft fit", found.begun, (*task.decisions, *found.decisions))
         done = _in_motion(found, found.bodies, task, choice, found.oversample)
         if folder is not None:
@@ -118,9 +126,16 @@ def track(
                 write_rest(folder, found.rest)
             told = {"steps": len(found.records), "times_s": task.scan.instants.tolist(), "bodies": found.bodies.count}
             told |= {"bodies_at_each_time": list(found.found)}
+            told |= {} if after is None else {"moved_from_forecast": found.moved}
             write_run(folder, done, task, None, told)
             write_tracks(folder, found.bodies, scan, _more(found, scan))
         return done
+
+
+def _hash(forecast: Forecast) -> str:
+    """A short fingerprint (SHA-256) of a forecast."""
+    arrays = forecast.times, forecast.band, forecast.bodies.coefficients.detach().numpy()
+    return hashlib.sha256(b"".join(np.ascontiguousarray(each).tobytes() for each in arrays)).hexdigest()[:16]
 
 
 def _in_motion(

@@ -1,0 +1,132 @@
+"""A forecast as the prior of the frames of its times: a filter, which predicts and is then corrected (Kalman 1960)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..checks import require
+from ..fit.problem import Batch
+from ..matter import Matter
+from ..mesh import TriangleMesh, across, areas, normals
+from ..representations import MovingSurfaces, TimeBasis
+from .elastic import OfPaths
+from .forecast import Forecast, on_paths, places_of
+
+SAME_TIME = 1e-3
+"""Share of a step within which two times are one."""
+
+
+def second_order_field(draws: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
+    """A random smooth field A ξ + B ξ ξ of places ξ [P, 3], whose terms have a mean square of one where |ξ| is one."""
+    first, second = (draws.normal(size=size) / 3**0.5 for size in ((3, 3), (3, 3, 3)))
+    return lambda xi: xi @ first.T + np.einsum("ijk,pj,pk->pi", second, xi, xi)
+
+
+@dataclass(frozen=True)
+class Expected:
+    """Where a forecast has bodies at the times of frames, and how surely.
+
+    bodies: their triangles, unit and material; times: [T] s; places: of each body [T, P, 3] m; band: [T, B] m, standard
+    error of each surface along its normals (rms over it), which is taken to be one number at a time
+    """
+
+    bodies: MovingSurfaces
+    times: np.ndarray
+    places: Sequence[np.ndarray]
+    band: np.ndarray
+
+    @classmethod
+    def of(cls, forecast: Forecast, times: np.ndarray, unit: float, matter: Matter) -> Expected:
+        """At the `times` [T] s of frames; unit: their pixel size [m]. Errors: `InputError` for times that the forecast
+        does not reach, and for one without standard errors."""
+        first, last = float(forecast.times[0]), float(forecast.times[-1])
+        slack = SAME_TIME * float(np.median(np.diff(times)))
+        require(
+            bool(first - slack <= times[0] and times[-1] <= last + slack),
+            f"the forecast must reach over the times of the frames, {times[0]:.6g} to {times[-1]:.6g} s, but it goes "
+            f"from {first:.6g} to {last:.6g} s; give it more --times, or follow fewer by --time-frames.",
+        )
+        require(
+            bool((np.nan_to_num(forecast.band) > 0).all()),
+            "the forecast must have standard errors, but it has none; make it with --half-sets.",
+        )
+        within = np.clip(times, first, last)
+        band = np.stack([np.interp(within, forecast.times, one) for one in forecast.band.T], axis=1)
+        there = forecast.bodies
+        bodies = MovingSurfaces(
+            *(there.coefficients.detach() * (there.unit_length / unit), there.faces, there.of_body, there.basis),
+            *(unit, matter, there.lines),
+        )
+        return cls(bodies, times, places_of(bodies, within), band)
+
+    @property
+    def count(self) -> int:
+        """Number of bodies, which are the first ones of a fit."""
+        return self.bodies.count
+
+    def on(self, basis: TimeBasis) -> MovingSurfaces:
+        """The bodies on paths of a basis."""
+        return on_paths(self.bodies, self.times, list(self.places), basis)
+
+    def astray(self, seed: int, side: int) -> Expected:
+        """The prior of one half of the frames (side 1, or -1): of half the information, about places to that side.
+
+        The places of both are one standard error off to either side, by a random field of second order, so that halves
+        differ by what prior and frames together leave open: half their difference has the variance 1/(p + 1/s²) of
+        frames of information p and a prior of standard error s.
+        """
+        draws, moved = np.random.default_rng([seed, 2]), list[np.ndarray]()
+        for k, own in enumerate(self.places):
+            field, faces = second_order_field(draws), self.bodies.body(k)[1].numpy()
+            off = []
+            for place, error in zip(own, self.band[:, k]):
+                mesh, middle = TriangleMesh(place, faces), place.mean(0)
+                shape = place - middle
+                away = field(shape / np.sqrt(np.square(shape).sum(1).mean()))
+                along = np.average((away * normals(mesh)).sum(1) ** 2, weights=areas(mesh)) ** 0.5
+                off.append(place + side * error / along * away)
+            moved.append(np.array(off))
+        return replace(self, places=moved, band=2**0.5 * self.band)
+
+    def deviation(self, found: MovingSurfaces) -> float:
+        """Distance along normals of the first of `found` bodies from their places (rms over bodies and times), in the
+        forecast's standard errors: about one or less where these are right."""
+        faces = (self.bodies.body(k)[1].numpy() for k in range(self.count))
+        pairs = zip(self.places, places_of(found, self.times), faces)
+        away = np.stack([across(one, other, own) for one, other, own in pairs], axis=1)
+        return float(np.square(away / self.band).mean() ** 0.5)
+
+
+class NearExpected(OfPaths):
+    """Σ over bodies of the mean over times of (d/s)², d the distance along normals from where a forecast has a body
+    (rms over its surface), and s the standard error of that: of bodies beside its own, nothing."""
+
+    def __init__(self, weight: float, expected: Expected, basis: TimeBasis) -> None:
+        """basis: of the paths, in pixels."""
+        super().__init__("forecast", weight)
+        unit, shares = expected.bodies.unit_length, list[np.ndarray]()
+        normal, faces = list[np.ndarray](), [expected.bodies.body(k)[1].numpy() for k in range(expected.count)]
+        for k, own in enumerate(expected.places):
+            meshes = [TriangleMesh(place, faces[k]) for place in own]
+            normal.append(np.stack([normals(mesh) for mesh in meshes]))
+            parts = np.stack([areas(mesh) / areas(mesh).sum() for mesh in meshes])
+            shares.append(parts * (unit / expected.band[:, k, None]) ** 2 / len(expected.times))
+
+        def together(parts: list[np.ndarray]) -> Tensor:
+            return torch.from_numpy(np.concatenate(parts, axis=1))
+
+        self._normals, self._shares = together(normal), together(shares)
+        self._along = (self._normals * together([own / unit for own in expected.places])).sum(2)
+        self._weights = torch.from_numpy(basis.weights(expected.times))
+
+    def value(self, paths: Tensor, batch: Batch) -> Tensor:
+        """As the class says."""
+        count = self._normals.shape[1]
+        places = torch.einsum("tk,kpx->tpx", self._weights, paths[:, :count])
+        away = (self._normals * places).sum(2) - self._along
+        return (self._shares * away.square()).sum()
