@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -178,4 +179,35 @@ def test_what_cannot_be_carried_on_is_refused(folder):
     refused(holosplat(*through, "--peak", "0.2:0.1"), "--peak", "LOW:HIGH")
     refused(holosplat(*through, "--shear-modulus", "soft"), "--shear-modulus")
     refused(holosplat("forecast", folder, "--out", out), "must hold a reconstruction")
+    assert not out.exists()
+
+
+def test_later_frames_correct_a_forecast(folder):
+    """Frames that the forecast itself predicts leave its bodies where they are, with their numbers."""
+    frames, out = folder / "later" / "forecast.nxs", folder / "corrected"
+    how = ("--material", "haemoglobin", "--rounds", 0, "--effort", 0.1, "--after", folder / "later", "--out", out)
+    with undrawn():
+        said = worked_by("track", frames, *how)
+    assert "standard errors of the forecast" in said.out
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["bodies"] == 3
+    assert summary["moved_from_forecast"] < 0.5
+    assert "after" in json.loads((out / "config.json").read_text())
+    bodies = [read_object(folder / name / "object.h5") for name in ("corrected", "later")]
+    for ours, theirs in zip(*(of.bodies(STEP * (TIMES - 1)) for of in bodies if isinstance(of, MovingSurfaces))):
+        assert ours.vertices.mean(0) == pytest.approx(theirs.vertices.mean(0), abs=0.1 * PIXEL)
+
+
+def test_only_a_forecast_that_reaches_over_the_frames_is_taken(folder):
+    out, unsure = folder / "none", folder / "unsure"
+    how = ("--material", "haemoglobin", "--out", out)
+    scan, times = folder / "scan.nxs", ("--time-frames", f"{TIMES - 2}:{TIMES}")
+    refused(holosplat("track", scan, *how, "--after", folder / "run"), "a folder that holosplat forecast wrote")
+    refused(holosplat("track", scan, *times, *how, "--after", folder / "later"), "must reach over the times")
+    shutil.copytree(folder / "later", unsure)
+    rows = [row.split(",") for row in (unsure / "forecast.csv").read_text().splitlines()]
+    unknown = (",".join([*row[:2], "nan" if k else row[2]]) for k, row in enumerate(rows))
+    (unsure / "forecast.csv").write_text("\n".join(unknown))
+    frames = unsure / "forecast.nxs"
+    refused(holosplat("track", frames, *how, "--after", unsure), "must have standard errors", "--half-sets")
     assert not out.exists()

@@ -129,11 +129,11 @@ def test_fits_of_the_choice_of_paths_are_not_made_again(monkeypatch):
     result = follow(scan(), MATERIAL, free, journal=(every := Kept()))
     at = next(k for k, one in enumerate(every.plain) if one["next"] == "paths")
 
-    def fitted(frames, start, *given):
+    def fitted(frames, start, *given, expected):
         fits.append(start.basis.pieces)
         if len(fits) == 2:
             raise KeyboardInterrupt
-        return motion_fit(frames, start, *given)
+        return motion_fit(frames, start, *given, expected=expected)
 
     monkeypatch.setattr(path_fits, "motion_fit", fitted)
     with pytest.raises(KeyboardInterrupt):
@@ -170,7 +170,7 @@ def test_halves_of_few_views_begin_apart(monkeypatch):
     assert 0.5 < float(one[0, own].square().sum(1).mean().sqrt()) / (ASTRAY * radius) < 3
     assert tell_shapes(scan())
     assert not tell_shapes(three_views())
-    monkeypatch.setattr(body_tracker.BodyTracker, "fitted", lambda run, name, frames, start, how, light: start)
+    monkeypatch.setattr(body_tracker.BodyTracker, "fitted", lambda run, name, frames, start, how, light, expected=None: start)
     result = follow(three_views(), MATERIAL, QUICK)
     apart = result.halves[0].coefficients - result.halves[1].coefficients
     middle = 0.5 * (result.halves[0].coefficients + result.halves[1].coefficients)
@@ -180,7 +180,7 @@ def test_halves_of_few_views_begin_apart(monkeypatch):
 def test_halves_that_begin_apart_are_fitted_to_the_end_where_no_shape_is_known(monkeypatch):
     steps: list[tuple[str, int]] = []
 
-    def fitted(run, name, frames, start, how, light):
+    def fitted(run, name, frames, start, how, light, expected=None):
         steps.append((name, how.schedule.steps))
         return start
 

@@ -198,9 +198,12 @@ class BodyTracker:
             light = self.light and self.light.part(torch.from_numpy(part))
             side = 1 - 2 * (len(self.halves) % 2)
             told = tell_shapes(self.train)
-            bodies = bodies if told else astray(bodies, self.seed, side)
+            expected = None
+            if self.expected is not None:
+                expected, bodies = self.expected.astray(bodies, self.seed, side)
+            elif not told:
+                bodies = astray(bodies, self.seed, side)
             how = self.options.half if told or self.options.body else self.options.soft
-            expected = self.expected and self.expected.astray(self.seed, side)
             self.halves.append(self.fitted("intervals", self.train[part], bodies, how, light, expected))
         if len(self.halves) == len(parts):
             self.stage = "done"

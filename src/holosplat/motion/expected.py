@@ -27,6 +27,21 @@ def second_order_field(draws: np.random.Generator) -> Callable[[np.ndarray], np.
     return lambda xi: xi @ first.T + np.einsum("ijk,pj,pk->pi", second, xi, xi)
 
 
+def require_reach(forecast: Forecast, times: np.ndarray) -> None:
+    """`InputError` for a forecast that does not reach over the `times` [T] s, or has no standard errors."""
+    first, last = float(forecast.times[0]), float(forecast.times[-1])
+    slack = SAME_TIME * float(np.median(np.diff(times)))
+    require(
+        bool(first - slack <= times[0] and times[-1] <= last + slack),
+        f"the forecast must reach over the times of the frames, {times[0]:.6g} to {times[-1]:.6g} s, but it goes from "
+        f"{first:.6g} to {last:.6g} s; give it more --times, or follow fewer by --time-frames.",
+    )
+    require(
+        bool((np.nan_to_num(forecast.band) > 0).all()),
+        "the forecast must have standard errors, but it has none; make it with --half-sets.",
+    )
+
+
 @dataclass(frozen=True)
 class Expected:
     """Where a forecast has bodies at the times of frames, and how surely.
@@ -42,19 +57,9 @@ class Expected:
 
     @classmethod
     def of(cls, forecast: Forecast, times: np.ndarray, unit: float, matter: Matter) -> Expected:
-        """At the `times` [T] s of frames; unit: their pixel size [m]. Errors: `InputError` for times that the forecast
-        does not reach, and for one without standard errors."""
+        """At the `times` [T] s of frames; unit: their pixel size [m]. Errors: those of `require_reach`."""
+        require_reach(forecast, times)
         first, last = float(forecast.times[0]), float(forecast.times[-1])
-        slack = SAME_TIME * float(np.median(np.diff(times)))
-        require(
-            bool(first - slack <= times[0] and times[-1] <= last + slack),
-            f"the forecast must reach over the times of the frames, {times[0]:.6g} to {times[-1]:.6g} s, but it goes "
-            f"from {first:.6g} to {last:.6g} s; give it more --times, or follow fewer by --time-frames.",
-        )
-        require(
-            bool((np.nan_to_num(forecast.band) > 0).all()),
-            "the forecast must have standard errors, but it has none; make it with --half-sets.",
-        )
         within = np.clip(times, first, last)
         band = np.stack([np.interp(within, forecast.times, one) for one in forecast.band.T], axis=1)
         there = forecast.bodies
@@ -73,25 +78,18 @@ class Expected:
         """The bodies on paths of a basis."""
         return on_paths(self.bodies, self.times, list(self.places), basis)
 
-    def astray(self, seed: int, side: int) -> Expected:
-        """The prior of one half of the frames (side 1, or -1): of half the information, about places to that side.
+    def astray(self, bodies: MovingSurfaces, seed: int, side: int) -> tuple[Expected, MovingSurfaces]:
+        """The prior of one half of the frames (side 1, or -1), and what the fit of that half begins with.
 
-        The places of both are one standard error off to either side, by a random field of second order, so that halves
-        differ by what prior and frames together leave open: half their difference has the variance 1/(p + 1/s²) of
-        frames of information p and a prior of standard error s.
+        It has half the information, about places that are one standard error off to that side, by a random field of
+        second order; `bodies` begin as far off. So half the difference of the halves has the variance 1/(p + 1/s²) of
+        frames of information p and a forecast of standard error s, and s where frames say nothing.
         """
-        draws, moved = np.random.default_rng([seed, 2]), list[np.ndarray]()
-        for k, own in enumerate(self.places):
-            field, faces = second_order_field(draws), self.bodies.body(k)[1].numpy()
-            off = []
-            for place, error in zip(own, self.band[:, k]):
-                mesh, middle = TriangleMesh(place, faces), place.mean(0)
-                shape = place - middle
-                away = field(shape / np.sqrt(np.square(shape).sum(1).mean()))
-                along = np.average((away * normals(mesh)).sum(1) ** 2, weights=areas(mesh)) ** 0.5
-                off.append(place + side * error / along * away)
-            moved.append(np.array(off))
-        return replace(self, places=moved, band=2**0.5 * self.band)
+        draws, places, begun = np.random.default_rng([seed, 2]), list(self.places), places_of(bodies, self.times)
+        for k, (own, error) in enumerate(zip(self.places, self.band.T)):
+            off = side * _away(own, self.bodies.body(k)[1].numpy(), error, draws)
+            places[k], begun[k] = own + off, begun[k] + off
+        return replace(self, places=places, band=2**0.5 * self.band), on_paths(bodies, self.times, begun, bodies.basis)
 
     def deviation(self, found: MovingSurfaces) -> float:
         """Distance along normals of the first of `found` bodies from their places (rms over bodies and times), in the
@@ -100,6 +98,17 @@ class Expected:
         pairs = zip(self.places, places_of(found, self.times), faces)
         away = np.stack([across(one, other, own) for one, other, own in pairs], axis=1)
         return float(np.square(away / self.band).mean() ** 0.5)
+
+
+def _away(places: np.ndarray, faces: np.ndarray, error: np.ndarray, draws: np.random.Generator) -> np.ndarray:
+    """[T, P, 3] m: a random field of second order about a body's middle, of an rms `error` [T] m along its normals."""
+    field, found = second_order_field(draws), list[np.ndarray]()
+    for place, size in zip(places, error):
+        mesh, shape = TriangleMesh(place, faces), place - place.mean(0)
+        away = field(shape / np.sqrt(np.square(shape).sum(1).mean()))
+        along = np.average((away * normals(mesh)).sum(1) ** 2, weights=areas(mesh)) ** 0.5
+        found.append(size / along * away)
+    return np.array(found)
 
 
 class NearExpected(OfPaths):

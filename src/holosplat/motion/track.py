@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import torch
 
 from ..bodies.poses import two_beams
@@ -17,7 +18,7 @@ from ..progress import FitProgress
 from ..scan import Scan
 from .body_tracker import BodyTracker, Followed, require_times
 from .detections import predicted
-from .expected import Expected
+from .expected import Expected, require_reach
 from .forecast import Forecast
 from .track_linking import TrackOptions
 
@@ -53,6 +54,18 @@ def unexplained(of: BodyTracker) -> Score:
     return Score.of(torch.from_numpy(of.train.frames - predicted(of.train, of.bodies, of.oversample)))
 
 
+def require_prior(after: Forecast | None, options: TrackOptions, times: np.ndarray) -> None:
+    """`InputError` for a forecast that cannot be the prior of frames of these `times` [T] s."""
+    if after is None:
+        return
+    require(
+        options.body is None,
+        "the shape at rest must not be given beside a forecast, which has the shapes, but both are; leave --body, or "
+        "--after.",
+    )
+    require_reach(after, times)
+
+
 USUAL = TrackOptions()
 """The usual options of `follow`."""
 
@@ -86,11 +99,7 @@ def follow(
         how = replace(options, body=body)
         return BodyTracker(train, material, how, seed, light, run.part(name), on_progress, expected)
 
-    require(
-        after is None or options.body is None,
-        "the shape at rest must not be given beside a forecast, which has the shapes, but both are; leave --body, or "
-        "--after.",
-    )
+    require_prior(after, options, train.instants)
     pixel, matter = train.views.finest, Matter.one(*material)
     expected = after and Expected.of(after, train.instants, pixel, matter)
     every = tracker("any", options.body)

@@ -26,7 +26,7 @@ from ..motion.elastic import Rest, strain_energy
 from ..motion.flow_reconstruction import FlowOptions, FlowResult, FlowSearch, merged
 from ..motion.forecast import Forecast
 from ..motion.measures import columns, measured, row, standard_errors
-from ..motion.track import USUAL, follow
+from ..motion.track import USUAL, follow, require_prior
 from ..motion.track_linking import TrackOptions
 from ..optics.background import LightOptions
 from ..optics.sampling import fringe_sampling
@@ -104,6 +104,7 @@ def track(
         not isinstance(prior, KnownSeveral), "bodies are of one material, but several are known; give --material once."
     )
     require_times(scan.train())
+    require_prior(after, options, scan.train().instants)
     check_frames(scan.train())
     assumed = light or LightOptions()
     config = config_of(scan, prior, options, seed, "levels", assumed)
