@@ -170,7 +170,7 @@ def test_halves_of_few_views_begin_apart(monkeypatch):
     assert 0.5 < float(one[0, own].square().sum(1).mean().sqrt()) / (ASTRAY * radius) < 3
     assert tell_shapes(scan())
     assert not tell_shapes(three_views())
-    monkeypatch.setattr(body_tracker.BodyTracker, "fitted", lambda run, name, frames, start, how, light, expected=None: start)
+    monkeypatch.setattr(body_tracker.BodyTracker, "fitted", lambda run, name, frames, start, *given: start)
     result = follow(three_views(), MATERIAL, QUICK)
     apart = result.halves[0].coefficients - result.halves[1].coefficients
     middle = 0.5 * (result.halves[0].coefficients + result.halves[1].coefficients)

@@ -38,7 +38,8 @@ def require_reach(forecast: Forecast, times: np.ndarray) -> None:
     )
     require(
         bool((np.nan_to_num(forecast.band) > 0).all()),
-        "the forecast must have standard errors, but it has none; make it with --half-sets.",
+        "the forecast must have standard errors, but it has none; make it with --half-sets, of a run of six times or "
+        "more.",
     )
 
 
