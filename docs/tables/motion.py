@@ -119,6 +119,31 @@ def ablation() -> str:
     return markdown(head, lines)
 
 
+@table("filter", "python benchmarks/filter.py DATA --cases flow3 flow2n --first 26 --write", "an hour", "filter.csv")
+def after_a_forecast() -> str:
+    """A window alone, and with the forecast of the window before as prior."""
+    rows = sorted(read("filter.csv"), key=lambda row: (list(BEAMS).index(row["case"]), int(row["first"])))
+    lines = []
+    for row in rows:
+        first = int(row["first"]) + int(row["before"])
+        errors = [_or_nothing(row[f"{name}_over_error"], 2) for name in ("centre", "volume")]
+        lines.append(
+            [
+                BEAMS[row["case"]],
+                f"{first} … {first + int(row['times']) - 1}",
+                row["way"],
+                f"{rounded(row['dice'], 3)} ({rounded(row['least_dice'], 3)})",
+                f"{row['followed']} of {row['cells']}",
+                f"{_significant(row['centre_um'], 2)} µm",
+                *errors,
+                _or_nothing(row["moved"], 1),
+                f"{rounded(row['cpu_seconds'], 0)} s",
+            ]
+        )
+    head = ("beams", "snapshots", "by", COLUMNS[0], *COLUMNS[2:5:2], "centres", "volumes", "moved", "processor time")
+    return markdown(head, lines)
+
+
 def _window(row: Row) -> tuple[int, int]:
     return int(row["first"]), int(row["every"])
 

@@ -14,6 +14,7 @@ from ..io.formats import read_frames, run_reading, run_source
 from ..io.reading import Reading, Told, ends_of
 from ..motion.cell_model import ChannelFrame
 from ..motion.dynamics import DynamicsForecast
+from ..motion.expected import SAME_TIME
 from ..motion.fit import MotionFit
 from ..motion.forecast import PathForecast
 from ..motion.learned import GraphForecast
@@ -26,7 +27,6 @@ from ..specimens.flow.suspension import PLASMA_VISCOSITY
 from ..workflows.evaluate import evaluate
 from ..workflows.forecast import (
     FRAMES,
-    SAME_TIME,
     TABLE,
     Forecasted,
     ForecastOptions,

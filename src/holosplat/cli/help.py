@@ -50,7 +50,7 @@ ESSENTIAL: dict[str, tuple[str, ...]] = {
     ),
     "retrieve": ("method", *MATTER, *READ),
     "reconstruct": (*MATTER, *METHOD, "motion", "refine", "seed", "resume", "strict", *READ, "test_views"),
-    "track": (*MATTER, "learned", "cells", "intervals", "seed", "resume", *READ),
+    "track": (*MATTER, "after", "learned", "cells", "intervals", "seed", "resume", *READ),
     "watch": (*MATTER, *METHOD, "pattern", "seed", *READ),
     "surface": ("scan", "level", "spacing", "smoothing", "steps", "truth", *READ),
     "render": ("split", *READ),

@@ -19,6 +19,7 @@ from ..methods.presets import SCHEMA
 from ..metrics import image_scores, intensity_range
 from ..motion.assimilate import carry_by_frames
 from ..motion.dynamics import DynamicsForecast, HybridForecast, window_of
+from ..motion.expected import SAME_TIME
 from ..motion.forecast import Forecast, Forecaster, Halves, History, PathForecast, decided
 from ..motion.learned import GraphForecast, read_dynamics
 from ..motion.measures import early_part, half_fit, half_sets
@@ -42,8 +43,6 @@ MOST_TIMES = 1000
 """Of a forecast."""
 UNTOLD = 0.5
 """Standard error after the fit over that before from which on a number counts as undetermined."""
-SAME_TIME = 1e-3
-"""Share of a step within which two times are one."""
 
 
 @checked_dataclass
