@@ -102,3 +102,12 @@ def test_nothing_is_overwritten(shop, tmp_path):
             (out / "mine").write_text("mine")
         refused(holosplat("retrieve", shop.scan, *MATTER, "--out", out), name)
     refused(holosplat("retrieve", shop.scan, *MATTER, "--out", tmp_path / "nowhere/maps.h5"), "nowhere")
+
+
+def test_counts_are_refused(shop, tmp_path):
+    """Their logarithm would be a phase of nothing."""
+    scan = read_scan(shop.scan)
+    write_scan(tmp_path / "counts.nxs", hs.Scan(3000 * scan.frames[:], scan.exposures, scan.is_test))
+    for act in ("retrieve", "align"):
+        refused(holosplat(act, tmp_path / "counts.nxs", *MATTER, "--out", tmp_path / "out.nxs"), "--flats", "median")
+    assert not (tmp_path / "out.nxs").exists()
