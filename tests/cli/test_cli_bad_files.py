@@ -109,6 +109,11 @@ def test_an_archive_that_was_cut_off_is_called_damaged(tmp_path):
     refused(holosplat("retrieve", cut, "--delta-beta", "1000", "--out", tmp_path / "out.h5"), "whole.npz", "damaged")
 
 
+def test_text_is_no_hdf5_file(tmp_path):
+    (tmp_path / "text.nxs").write_text("hello")
+    refused(holosplat("check", tmp_path / "text.nxs"), "text.nxs", "does not start like one")
+
+
 def test_bad_truths_are_refused(shop, tmp_path):
     half = truncated(shop.truth, tmp_path)
     refused(holosplat("evaluate", shop.run, "--truth", half), "truth.h5", "truncated")

@@ -85,6 +85,7 @@ def test_uneven_light_is_found_said_and_written(tmp_path):
         (("--material", FORMULA), ("density",)),
         ((*MATTER, "--delta-beta", "100"), ("not both",)),
         ((*MATTER, "--views", "99"), ("--views", "99")),
+        ((*MATTER, "--bin", "25"), ("binned by 1 to 24, but not by 25",)),
         ((*MATTER, "--air", "0", "99", "0", "5"), ("--air", "24 rows")),
         ((*MATTER, "--light", "smooth"), ("no frame shows air", "--light even")),
     ],

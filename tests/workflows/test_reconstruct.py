@@ -18,7 +18,7 @@ from holosplat.fit.problem import Schedule
 from holosplat.fit.terms import Objective
 from holosplat.geometry import Grid, Views
 from holosplat.matter import MaterialPrior, Matter
-from holosplat.methods import FitOptions, Task
+from holosplat.methods import FitOptions, Task, Voxels
 from holosplat.methods.presets import preset
 from holosplat.methods.start import starting_cloud
 from holosplat.model import measure
@@ -84,6 +84,17 @@ def test_a_scan_without_training_frames_is_refused(scan, tmp_path):
     with pytest.raises(InputError, match="no training frame"):
         reconstruct(replace(scan, is_test=np.ones(8, dtype=bool)), KNOWN, SMALL, folder=folder)
     assert not folder.path.exists()
+
+
+def test_values_of_other_types_are_refused_by_name(scan):
+    for given, words in (
+        ((scan.frames, KNOWN), "scan must be a Scan, as hs.read gives"),
+        ((scan, "haemoglobin"), "prior must be a MaterialPrior.* but it is 'haemoglobin'"),
+        ((scan, KNOWN, "gaussians"), "method must be options of a method.* but it is 'gaussians'"),
+        ((scan, KNOWN, Voxels), "method must be options of a method"),
+    ):
+        with pytest.raises(InputError, match=words):
+            reconstruct(*given)
 
 
 @pytest.mark.parametrize(
