@@ -22,7 +22,7 @@ from holosplat.methods import FitOptions, Task, Voxels
 from holosplat.methods.presets import preset
 from holosplat.methods.start import starting_cloud
 from holosplat.model import measure
-from holosplat.representations import GaussianCloud
+from holosplat.representations import GaussianCloud, VoxelGrid
 from holosplat.representations.gaussians import raw_of
 from holosplat.volume import Volume
 from holosplat.workflows.evaluate import evaluate, material_found, render
@@ -268,6 +268,17 @@ def test_the_material_of_a_free_cloud_is_that_of_its_matter():
     assert not found.single_material
     assert found.ratio == pytest.approx(4 * CELL.ratio, rel=0.01)
     assert 0.1 * CELL.delta < found.delta < 0.8 * CELL.delta
+
+
+def test_the_material_of_continuous_matter_is_what_its_volume_holds():
+    """Its unit of δ says nothing of it, on both sides of the medium least of all."""
+    values, unit = torch.zeros(1, 8, 9, 10), 1e-9
+    values[0, 2:5, 2:5, 2:5], values[0, 6, 1:8, 1:8] = -500.0, 20.0
+    found = VoxelGrid(values, Grid((8, 9, 10), (PIXEL,) * 3, (0.0, 0.0, 0.0)), Matter.one(unit, unit / 2000))
+    assert material_found(found).delta == unit
+    whole = material_found(found, "continuous")
+    assert whole.single_material
+    assert (whole.delta, whole.ratio) == pytest.approx((-500 * unit, 2000), rel=1e-5)
 
 
 def test_a_backend_is_refused_before_the_start(scan):
