@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -41,5 +43,18 @@ def test_binned_pixels_are_where_they_say(shape, factor):
 def test_binning_by_one_changes_nothing_and_by_too_much_is_refused():
     cell_scan = scan_of(cells(CELL), Views.evenly_spaced(8, SHAPE, PIXEL))
     assert cell_scan.binned(1) is cell_scan
-    with pytest.raises(InputError, match="binned by 37"):
+    with pytest.raises(InputError, match="binned by 1 to 36, but not by 37"):
         cell_scan.binned(37)
+    with pytest.raises(InputError, match="but not by 0"):
+        cell_scan.binned(0)
+
+
+def test_frames_views_and_exposures_of_other_kinds_are_refused():
+    views = Views.evenly_spaced(8, SHAPE, PIXEL)
+    with pytest.raises(InputError, match="frames must be intensities, but they are complex"):
+        Scan(np.ones((8, *SHAPE), dtype=complex), Exposures.of(views, 20.0, 0.1), np.zeros(8, bool))
+    with pytest.raises(InputError, match=r"energy_kev must have the shape \(8\), but it has the shape \(2\)"):
+        replace(Exposures.of(views, 20.0, 0.1), energy_kev=np.array([20.0, 21.0]))
+    for shape in (24, (24.5, 24), (24, 24, 24)):
+        with pytest.raises(InputError, match="two positive counts"):
+            Views.evenly_spaced(8, shape, PIXEL)  # pyright: ignore[reportArgumentType]

@@ -142,8 +142,8 @@ def finite(field: str, array: np.ndarray) -> np.ndarray:
 def shaped(field: str, array: np.ndarray, shape: tuple[int | None, ...]) -> np.ndarray:
     """`array` unchanged, if its shape matches `shape` (None matches any length); `InputError` otherwise."""
     if array.ndim != len(shape) or any(want is not None and want != got for want, got in zip(shape, array.shape)):
-        wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
-        raise InputError(f"{field} must have the shape {wanted}, but it has the shape {tuple(array.shape)}.")
+        wanted, found = (", ".join("any" if n is None else str(n) for n in one) for one in (shape, array.shape))
+        raise InputError(f"{field} must have the shape ({wanted}), but it has the shape ({found}).")
     return array
 
 

@@ -91,6 +91,7 @@ class Binned(Derived):
     """Other frames on pixels `factor` times larger."""
 
     def __init__(self, frames: Frames, factor: int) -> None:
+        require_factor(frames.shape[1:], factor)
         self._frames, self._factor = frames, factor
         self.shape = (len(frames), frames.shape[1] // factor, frames.shape[2] // factor)
 
@@ -139,13 +140,19 @@ def picked(frames: np.ndarray | Frames, index: Index) -> np.ndarray | Frames:
     return frames[index] if isinstance(frames, np.ndarray) else Picked(frames, index)
 
 
+def require_factor(shape: tuple[int, ...], factor: int) -> None:
+    """`InputError` for a factor of larger pixels that frames of `shape` (H, W) cannot be binned by."""
+    most = min(shape)
+    require(1 <= factor <= most, f"frames of {tuple(shape)} pixels are binned by 1 to {most}, but not by {factor}.")
+
+
 def binned(frames: np.ndarray, factor: int) -> np.ndarray:
     """Frames [N, H, W] on pixels `factor` times larger (means of `factor × factor`); odd rows and columns are cut.
 
     The cut is even on both sides, or one pixel more below and on the right.
     """
     shape = frames.shape[1:]
-    require(min(shape) >= factor, f"frames of {tuple(shape)} pixels cannot be binned by {factor}.")
+    require_factor(shape, factor)
     top, left = (n % factor // 2 for n in shape)
     return block_means(frames[:, top:, left:], factor)
 

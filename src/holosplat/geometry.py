@@ -69,7 +69,7 @@ class Views:
         require(
             far <= FARTHEST_PX, f"detector shift must be at most {FARTHEST_PX:g} pixels, but it is {far:g}; correct it."
         )
-        if len(self.shape) != 2 or min(self.shape) < 1:
+        if np.shape(self.shape) != (2,) or min(self.shape) < 1 or any(int(n) != n for n in self.shape):
             raise InputError(f"detector shape must be two positive counts (rows, columns), but it is {self.shape}.")
         object.__setattr__(self, "rotations", rotations)
         object.__setattr__(self, "shifts", shifts)

@@ -69,7 +69,8 @@ class Exposures:
         for size in np.unique(self.views.pixel_sizes):
             in_range("pixel size", float(size), *PIXEL_RANGE_M, unit="metres")
         for name in PER_FRAME:
-            array = np.broadcast_to(np.asarray(getattr(self, name), dtype=np.float64), (count,))
+            array = np.asarray(getattr(self, name), dtype=np.float64)
+            array = np.broadcast_to(array if array.size == 1 else shaped(name, array, (count,)), (count,))
             object.__setattr__(self, name, array.copy())
         for energy in (*self.energy_kev, *([] if self.reference_kev is None else [self.reference_kev])):
             in_range("energy", float(energy), *BEAM_RANGE_KEV, unit="keV")
@@ -240,6 +241,7 @@ class Scan:
         if isinstance(self.source, Frames):
             require(self.source.shape == wanted, f"frames must have the shape {wanted}, but it is {self.source.shape}.")
         else:
+            require(not np.iscomplexobj(self.source), "frames must be intensities, but they are complex; square them.")
             frames = shaped("frames", np.ascontiguousarray(self.source, dtype=np.float32), wanted)
             object.__setattr__(self, "source", finite("frames", frames))
             if self._missing is not None:
@@ -410,10 +412,7 @@ class Scan:
 
     def train(self) -> Scan:
         """The training frames only; `InputError` when there are none."""
-        require(
-            not bool(self.is_test.all()),
-            "the scan has no training frame (every entry of /entry/split is 1); mark at least one frame 0.",
-        )
+        require(not self.is_test.all(), "the scan has no training frame: --test-views or /entry/split holds all out.")
         return self[np.flatnonzero(~self.is_test)]
 
     def test(self) -> Scan:

@@ -52,7 +52,8 @@ def read_table(path: Path) -> dict[str, Any]:
     except RecursionError:
         raise InputError(f"{path} must be valid {language}, but it is nested too deeply; make it flat.") from None
     except ValueError as error:  # both decoders' errors
-        raise InputError(f"{path} must be valid {language}, but: {error}.") from None
+        other = "" if toml else "; the name of a TOML file ends with .toml"
+        raise InputError(f"{path} must be valid {language}, but: {error}{other}.") from None
     require(isinstance(table, dict), f"{path} must hold a table, but it holds {type(table).__name__}.")
     return table
 

@@ -102,6 +102,18 @@ def test_damaged_runs_are_refused(shop, tmp_path, file, change, words):
     assert not (tmp_path / "v.h5").exists()
 
 
+def test_an_archive_that_was_cut_off_is_called_damaged(tmp_path):
+    np.savez(tmp_path / "whole.npz", counts=np.ones((3, 20, 20)))
+    (tmp_path / "cut").mkdir()
+    cut = truncated(tmp_path / "whole.npz", tmp_path / "cut")
+    refused(holosplat("retrieve", cut, "--delta-beta", "1000", "--out", tmp_path / "out.h5"), "whole.npz", "damaged")
+
+
+def test_text_is_no_hdf5_file(tmp_path):
+    (tmp_path / "text.nxs").write_text("hello")
+    refused(holosplat("check", tmp_path / "text.nxs"), "text.nxs", "does not start like one")
+
+
 def test_bad_truths_are_refused(shop, tmp_path):
     half = truncated(shop.truth, tmp_path)
     refused(holosplat("evaluate", shop.run, "--truth", half), "truth.h5", "truncated")

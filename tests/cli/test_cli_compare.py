@@ -32,6 +32,7 @@ def test_a_run_is_the_same_as_itself(shop, tmp_path):
     page = (tmp_path / "page.html").read_text()
     assert "Slices of both" in page
     assert "A with B in Fourier space" in page
+    assert "Nothing differs." in page
 
 
 def test_what_differs_is_said_on_the_terminal_and_on_the_page(shop, coarse, tmp_path):

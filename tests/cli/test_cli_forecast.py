@@ -89,6 +89,9 @@ def test_without_half_sets_nothing_is_said_of_errors(folder):
         )
     assert "standard error of surfaces: not told" in said.out
     assert "nothing else was asked, for that needs half-sets" in said.out
+    page = (out / "report.html").read_text()
+    assert "This is a forecast of the time" in page
+    assert "of the reconstruction</small>" not in page
     times, band = read_band(RunFolder(out))
     assert np.isnan(band).all()
     assert times == pytest.approx(json.loads((out / "forecast.json").read_text())["times_s"], rel=1e-12, abs=0)

@@ -85,6 +85,7 @@ def test_uneven_light_is_found_said_and_written(tmp_path):
         (("--material", FORMULA), ("density",)),
         ((*MATTER, "--delta-beta", "100"), ("not both",)),
         ((*MATTER, "--views", "99"), ("--views", "99")),
+        ((*MATTER, "--bin", "25"), ("binned by 1 to 24, but not by 25",)),
         ((*MATTER, "--air", "0", "99", "0", "5"), ("--air", "24 rows")),
         ((*MATTER, "--light", "smooth"), ("no frame shows air", "--light even")),
     ],
@@ -102,3 +103,12 @@ def test_nothing_is_overwritten(shop, tmp_path):
             (out / "mine").write_text("mine")
         refused(holosplat("retrieve", shop.scan, *MATTER, "--out", out), name)
     refused(holosplat("retrieve", shop.scan, *MATTER, "--out", tmp_path / "nowhere/maps.h5"), "nowhere")
+
+
+def test_counts_are_refused(shop, tmp_path):
+    """Their logarithm would be a phase of nothing."""
+    scan = read_scan(shop.scan)
+    write_scan(tmp_path / "counts.nxs", hs.Scan(3000 * scan.frames[:], scan.exposures, scan.is_test))
+    for act in ("retrieve", "align"):
+        refused(holosplat(act, tmp_path / "counts.nxs", *MATTER, "--out", tmp_path / "out.nxs"), "--flats", "median")
+    assert not (tmp_path / "out.nxs").exists()

@@ -121,6 +121,7 @@ def refused(outcome: Outcome, *words: str) -> None:
     assert len(lines) == 1, outcome.err
     assert outcome.err.rstrip().endswith(lines[0])
     assert lines[0].endswith((".", "?"))
+    assert not lines[0].endswith("..")
     assert "np." not in lines[0]
     for word in words:
         assert word in lines[0], f"{word!r} not in {lines[0]!r}"

@@ -227,7 +227,7 @@ def test_files_are_toml_or_json_by_their_names(tmp_path):
     ("name", "content", "message"),
     [
         ("a.toml", b"a = = 1", r"a\.toml must be valid TOML, but"),
-        ("a.json", b"{", r"a\.json must be valid JSON, but"),
+        ("a.json", b"{", r"a\.json must be valid JSON, but.*; the name of a TOML file ends with \.toml\."),
         ("a.json", b"[1]", r"a\.json must hold a table, but it holds list"),
         ("a.json", b"\xff", r"a\.json must be a readable JSON file"),
         ("a.toml", None, r"a\.toml must be a TOML file, but there is no such file"),

@@ -105,6 +105,11 @@ def test_flats_and_darks_that_are_mostly_the_other_are_refused(tmp_path, flats, 
         read_scan(raw_file(tmp_path / "raw.nxs", flats, darks))
 
 
+def test_darks_that_are_missing_are_said(tmp_path, caplog):
+    read_scan(raw_file(tmp_path / "raw.nxs", FLATS, DARKS[:0]))
+    assert "flats, but no darks: the counts without light are taken as 0; add --darks" in caplog.text
+
+
 def test_dead_pixels_have_no_weight(tmp_path, caplog):
     path = raw_file(tmp_path / "raw.nxs", np.where(np.arange(SHAPE[1]) < 6, 0, FLATS), DARKS)
     with pytest.raises(

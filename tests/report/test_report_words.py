@@ -16,6 +16,7 @@ from holosplat.report import (
 )
 from holosplat.report.blocks import _ends
 from holosplat.report.content import flatten
+from holosplat.report.curves import history_figure
 from holosplat.report.page import NOT_REHEARSED, VERDICTS, duration, headline, percent
 from holosplat.report.style import format_length, in_print, scientific
 from holosplat.report.surface import camera
@@ -82,7 +83,9 @@ def test_rehearsals_give_the_headline_one_of_three_words():
     assert shown.step is not None
     assert "--angles FILE" in shown.step.command
     good = judged(True, words="The frames are explained to within their noise: the residual is 1 of it.")
-    assert headline(content(explained=good, rehearsal=replace(limited, explained=good))).text == VERDICTS["consistent"]
+    shown = headline(content(explained=good, rehearsal=replace(limited, explained=good)))
+    assert shown.text == VERDICTS["consistent"]
+    assert good.words in shown.words  # whole, for the headline says no noise
     assert NOT_REHEARSED in headline(content(explained=good)).words
 
 
@@ -155,4 +158,16 @@ def test_a_volume_below_half_of_its_material_says_that_no_surface_is_drawn(undra
     page = Page(render_page(replace(shown, reconstruction=thin, material_delta=shown.surface_material()))).text
     assert "No voxel of the reconstruction reaches it." in page
     assert "No voxel of the reconstruction does." in page
+    assert "Matter on the other side" not in page
+    both = replace(shown.reconstruction, delta=np.sin(np.arange(thin.delta.size)).reshape(thin.delta.shape))
+    page = Page(render_page(replace(shown, reconstruction=both, material_delta=1.0))).text
+    assert "Matter on the other side of the medium's is not drawn here" in page
     assert "β is zero" not in page
+
+
+def test_the_size_of_voxels_is_no_term_of_the_loss():
+    """It was drawn among them, as \"voxel px\"."""
+    steps = np.arange(1.0, 9.0)
+    figure = history_figure({"step": steps, "loss": 1 / steps, "voxel_px": np.repeat([2.0, 1.0], 4)})
+    assert figure is not None
+    assert len(figure.axes[0].lines) == 1

@@ -69,7 +69,9 @@ def test_what_is_missing_is_said(partly):
     assert "&lt;b&gt;no" in page  # names and reasons are text
     lines = table_of(states(partly))
     assert re.match(r" +1  failed +0 of +2 times  <b>no  matter", lines[1])
-    assert time_left(states(partly)).startswith("1 done, 0 running, 1 failed, 1 left; 2 of 5 times are done; the rest")
+    assert time_left(states(partly)).startswith(
+        "tasks: 1 done, 0 running, 1 failed, 1 left; 2 of 5 times are done; the rest"
+    )
     out = holosplat("series", "collect", partly.path)
     assert (out.code, "3 of 5 times are missing: 2, 3, 4" in out.err) == (4, True)
     assert "1 failed" in worked(holosplat("series", "status", partly.path)).out

@@ -242,9 +242,9 @@ def test_what_cannot_be_corrected(shop, tmp_path):
     out = tmp_path / "scan.nxs"
     with pytest.raises(InputError, match="at least three flats"):
         correct(shop.clean, out, CorrectionOptions("dynamic"))
-    with pytest.raises(InputError, match="must mark flats"):
+    with pytest.raises(InputError, match="must hold flats"):
         correct(shop.clean, out)
-    with pytest.raises(InputError, match=r"must mark flats .1. in image_key, but it marks 0"):
+    with pytest.raises(InputError, match=r"must hold flats .image_key 1., but it holds none; add --flats"):
         correct(shop.clean, out, CorrectionOptions("plain"))
     swapped = tmp_path / "swapped.nxs"
     swapped.write_bytes(shop.raw.read_bytes())

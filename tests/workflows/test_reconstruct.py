@@ -18,11 +18,11 @@ from holosplat.fit.problem import Schedule
 from holosplat.fit.terms import Objective
 from holosplat.geometry import Grid, Views
 from holosplat.matter import MaterialPrior, Matter
-from holosplat.methods import FitOptions, Task
+from holosplat.methods import FitOptions, Task, Voxels
 from holosplat.methods.presets import preset
 from holosplat.methods.start import starting_cloud
 from holosplat.model import measure
-from holosplat.representations import GaussianCloud
+from holosplat.representations import GaussianCloud, VoxelGrid
 from holosplat.representations.gaussians import raw_of
 from holosplat.volume import Volume
 from holosplat.workflows.evaluate import evaluate, material_found, render
@@ -84,6 +84,17 @@ def test_a_scan_without_training_frames_is_refused(scan, tmp_path):
     with pytest.raises(InputError, match="no training frame"):
         reconstruct(replace(scan, is_test=np.ones(8, dtype=bool)), KNOWN, SMALL, folder=folder)
     assert not folder.path.exists()
+
+
+def test_values_of_other_types_are_refused_by_name(scan):
+    for given, words in (
+        ((scan.frames, KNOWN), "scan must be a Scan, as hs.read gives"),
+        ((scan, "haemoglobin"), "prior must be a MaterialPrior.* but it is 'haemoglobin'"),
+        ((scan, KNOWN, "gaussians"), "method must be options of a method.* but it is 'gaussians'"),
+        ((scan, KNOWN, Voxels), "method must be options of a method"),
+    ):
+        with pytest.raises(InputError, match=words):
+            reconstruct(*given)
 
 
 @pytest.mark.parametrize(
@@ -257,6 +268,17 @@ def test_the_material_of_a_free_cloud_is_that_of_its_matter():
     assert not found.single_material
     assert found.ratio == pytest.approx(4 * CELL.ratio, rel=0.01)
     assert 0.1 * CELL.delta < found.delta < 0.8 * CELL.delta
+
+
+def test_the_material_of_continuous_matter_is_what_its_volume_holds():
+    """Its unit of δ says nothing of it, on both sides of the medium least of all."""
+    values, unit = torch.zeros(1, 8, 9, 10), 1e-9
+    values[0, 2:5, 2:5, 2:5], values[0, 6, 1:8, 1:8] = -500.0, 20.0
+    found = VoxelGrid(values, Grid((8, 9, 10), (PIXEL,) * 3, (0.0, 0.0, 0.0)), Matter.one(unit, unit / 2000))
+    assert material_found(found).delta == unit
+    whole = material_found(found, "continuous")
+    assert whole.single_material
+    assert (whole.delta, whole.ratio) == pytest.approx((-500 * unit, 2000), rel=1e-5)
 
 
 def test_a_backend_is_refused_before_the_start(scan):

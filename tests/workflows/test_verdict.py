@@ -89,6 +89,13 @@ def test_the_truth_is_good(photons):
     assert len(found.lines("training frames")) == 1
 
 
+def test_a_residual_above_the_noise_is_not_called_noise():
+    """The model's own error is allowed, too, and more than a small noise."""
+    found = on(a_scan(soft(), 400_000), soft(1.06))
+    assert found.good
+    assert "within noise and model error: the residual is 1.7 times the noise, 0.52 of both" in found.words
+
+
 def test_half_of_the_mass_gone_is_said_though_noise_is_as_large_as_the_contrast():
     scan = a_scan(soft(0.5), 2000)
     contrast = float(np.sqrt(np.mean((a_scan(soft(0.5)).frames - 1) ** 2)))

@@ -127,6 +127,7 @@ def align(
     from ..io.larger_frames import heightened, of_parts
     from ..io.nxtomo import write_scan
     from ..planning.acts import of_alignment
+    from ..workflows.preconditions import check_frames
 
     for path in (out, *([table] if table else []), *([geometry_out] if geometry_out else [])):
         require_writable(path)
@@ -140,6 +141,7 @@ def align(
     if not axis_only:
         tell_frames("align", measured.exposures, out, lambda seen: of_alignment(seen, how))
     measured = measured.in_memory()
+    check_frames(measured)
     prior = matter.prior(measured.exposures.reference_energy, reading.told.wall)
     errors, frames, missing, lasting = None, measured.source, measured.missing, np.arange(len(measured))
     if axis_only:

@@ -351,5 +351,7 @@ def backends() -> None:
         print(f"auto       would take {resolve('auto')}\n")
     except InputError:
         print("auto       finds neither cpu nor cuda\n")
-    for operation, *kinds in [["", *DESCRIPTIONS], *support_table()]:
-        print(f"{operation:36}" + "".join(f"{kind:22}" for kind in kinds).rstrip())
+    table = [["", *DESCRIPTIONS], *support_table()]
+    widths = [max(map(len, column)) + 2 for column in zip(*table)]
+    for row in table:
+        print("".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip())

@@ -26,6 +26,7 @@ from ..methods.method import STAND_IN_RATIO, shows_no_refraction
 from ..optics import retrieve_thickness
 from ..ranges import Metres, Natural, Positive, Signed, checked_dataclass, flag
 from ..scan import Scan
+from ..workflows.preconditions import check_frames
 from ..workflows.run_illumination import FixedPatternOptions, flatfield_corrected
 from .light import LightFlags
 from .options import OneMaterial, PriorOptions
@@ -207,6 +208,7 @@ def retrieve(
         method: Tikhonov through the full wave optics is the most reliable; docs/phase_retrieval.md compares them.
     """
     measured = read_frames(scan, reading).in_memory()
+    check_frames(measured)
     material, level = matter.at(measured.exposures.reference_energy)
     with ProgressBar() as bar:
         how = {"light": illumination.options(), "missing": measured.missing, "on_progress": bar.of("phase retrieval")}

@@ -89,7 +89,7 @@ def check(path: Positional[Path]) -> None:
     """
     count, wrong = look(path)
     if wrong:
-        raise InputError("; ".join(wrong) + ".")
+        raise InputError("; ".join(each.rstrip(".") for each in wrong) + ".")
     print(f"{path} is as it was written: {count} HDF5 file{'s' if count != 1 else ''} read to the end")
 
 

@@ -186,7 +186,8 @@ def forecast(
         last = len(found.forecast.times) - 1
         shown = _shown(scan, found)
         final = reconstruction_at(done, found.forecast.times.tolist(), last)
-        say(f"report: {report_run(new, final, shown, evaluate(final, shown, None), None)}")
+        ahead = f"This is a forecast of the time {1e6 * found.forecast.times[last]:.4g} µs, the last of {last + 1}."
+        say(f"report: {report_run(new, final, shown, evaluate(final, shown, None), None, ahead)}")
     say(f"wrote {out / COLLECTION}, {out / TRACKS}, {out / FRAMES}, {out / TABLE}")
 
 

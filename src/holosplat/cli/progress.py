@@ -57,6 +57,7 @@ def say_notes() -> None:
     logger = logging.getLogger("holosplat")
     logger.setLevel(logging.INFO)
     logger.handlers = [_Notes()]
+    logging.getLogger("tifffile").setLevel(logging.CRITICAL)  # what it says of damage, a sentence of ours says
 
 
 class ProgressBar:

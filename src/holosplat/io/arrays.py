@@ -93,8 +93,10 @@ def _holds_arrays(path: Path) -> bool:
     if h5py.is_hdf5(path):
         with open_hdf5(path) as file:
             return any(_holds_values(file.get(name)) for name in FRAMES)
-    if path.suffix.lower() != ".npz" or not zipfile.is_zipfile(path):
+    if path.suffix.lower() != ".npz":
         return False
+    if not zipfile.is_zipfile(path):
+        return True  # damaged, which the reader says
     with zipfile.ZipFile(path) as archive:
         return any(f"{name}.npy" in archive.namelist() for name in FRAMES)
 

@@ -103,6 +103,8 @@ def without_odd(file: ScanFile, is_told: bool) -> ScanFile:
         found[DARK] = odd_darks(darks, float(np.nanmedian(flats)))
         good = darks[~found[DARK]]
         flats = flats - np.median(good if len(good) else darks, axis=0)
+    else:
+        warn(f"{file.path} has flats, but no darks: the counts without light are taken as 0; add --darks")
     found[FLAT] = odd_flats(flats)
     kinds = file.kinds.copy()
     for kind, odd in found.items():

@@ -95,6 +95,8 @@ def _scene(content: ReportContent) -> Block:
     )
     if not _reaches(content.reconstruction, 0.5 * material):
         text += "No voxel of the reconstruction reaches it. "
+    if _reaches(content.reconstruction, -0.5 * material):
+        text += "Matter on the other side of the medium's is not drawn here, but in the slices. "
     if content.truth is None:
         text += "a, from the first side; b, turned by 90° about the vertical axis. The truth is not known."
     else:

@@ -31,7 +31,7 @@ from .style import (
     styled,
 )
 
-NOT_TERMS = ("step", "seconds", "loss", "count", "lr", "learning_rate", "memory", "val_")
+NOT_TERMS = ("step", "seconds", "loss", "count", "lr", "learning_rate", "memory", "val_", "voxel_px")
 """Columns of the history, or their beginnings, that are not terms of the loss."""
 SCORE_NAMES = {"ssim": "SSIM", "frcm": "FRCM", "dice": "Dice", "psnr": "PSNR", "l1": "L1"}
 

@@ -145,4 +145,4 @@ def _spectrum(axes: Axes, spectrum: Spectrum, found: ScanFacts, pixel: float) ->
     axes.set_xlim(0, 0.5)
     if spectrum.power.max(initial=0.0) > 0:
         axes.set_ylim(bottom=max(spectrum.power.max() * 1e-9, 0.3 * spectrum.power.min()))
-    axes.legend(loc="best")
+    axes.legend(loc="best", frameon=True, framealpha=1.0, edgecolor="none")  # the noise would cross its words

@@ -58,7 +58,7 @@ def headline(content: ReportContent) -> Headline:
     text, _, rest = re.sub("[:;] ", "\n", words, count=1).partition("\n")
     text, details = text.rstrip("."), tuple(filter(None, (rest[:1].upper() + rest[1:],)))
     if content.rehearsal is not None and found is content.explained:
-        return _rehearsed(content.rehearsal, (*details, scores), content.scan)
+        return _rehearsed(content.rehearsal, (words, scores), content.scan)
     if found.good:
         return Headline(text, True, (*details, scores, NOT_REHEARSED))
     text = f"Do not trust this volume: {text[0].lower()}{text[1:]}"
@@ -140,7 +140,7 @@ def key_figures(content: ReportContent) -> list[tuple[str, str, str]]:
             ("Dice", f"{content.volume_scores.dice:.3f}", f"at half of the {content.quantity.symbol}"),
             (f"Mean {content.quantity.symbol}", percent(content.volume_scores.delta_deviation), "against the truth"),
         ]
-    if content.seconds is not None:
+    if content.seconds:  # none of a forecast
         figures.append(("Time", duration(content.seconds), "of the reconstruction"))
     return figures
 

@@ -80,7 +80,8 @@ def report_run(
             test.views.pixel_sizes,
             evaluation.verdict,
         )
-    volume, scores, material = found.voxelise(grid), evaluation.volume, found.matter.single
+    volume, scores = found.voxelise(grid), evaluation.volume
+    material = found.matter.single and reconstruction.choice.matter == "levels"  # else a unit of δ
     train = scan.train()
     absorbs = not scan.exposures.distance.any()  # then δ, where it is told, is β times a ratio that no frame shows
     if absorbs or not reconstruction.delta_told:

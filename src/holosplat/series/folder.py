@@ -222,7 +222,7 @@ def _detail(state: TaskState) -> str:
 def time_left(states: Sequence[TaskState]) -> str:
     """How many tasks are in each state, and how long the rest takes at the pace so far."""
     names = [state.state for state in states]
-    counts = ", ".join(f"{names.count(name)} {name}" for name in ("done", "running", "failed", "left"))
+    counts = "tasks: " + ", ".join(f"{names.count(name)} {name}" for name in ("done", "running", "failed", "left"))
     times, done = sum(s.times[1] for s in states), sum(s.times[0] for s in states)
     seconds, open_ = sum(s.seconds for s in states), sum(s.times[1] - s.times[0] for s in states if s.state != "failed")
     if not open_:

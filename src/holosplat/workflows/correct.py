@@ -111,9 +111,9 @@ class FlatFielding:
         self.method: Method = options.method or ("dynamic" if self.flats >= ENOUGH_FLATS else "plain")
         dynamic = self.method == "dynamic"
         enough = self.flats >= (ENOUGH_FLATS if dynamic else 1)
-        wanted = "at least three flats (1) for the dynamic method" if dynamic else "flats (1)"
-        hint = "; take --method plain" if dynamic and self.flats else ""
-        require(enough, f"{file.path} must mark {wanted} in image_key, but it marks {self.flats}{hint}.")
+        wanted = "at least three flats for the dynamic method" if dynamic else "flats (image_key 1)"
+        remedy = "take --method plain" if dynamic and self.flats else "add --flats"
+        require(enough, f"{file.path} must hold {wanted}, but it holds {self.flats or 'none'}; {remedy}.")
         dark, noise = _mean_and_noise(file, darks)
         self.marked = file.mask()
         mean_flat = file.mean(FLAT)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from ..checks import as_written, require
 from ..fit.residuals import Prediction
 from ..geometry import Grid, Views
 from ..io.atomic import write_rows
-from ..matter import DeltaBeta
+from ..matter import DeltaBeta, MatterKind
 from ..metrics import ImageScores, VolumeScores, image_scores, intensity_range, volume_scores
 from ..metrics.images import json_number
 from ..model import Instrument, Model
@@ -185,7 +186,7 @@ def evaluate(reconstruction: Reconstruction, scan: Scan | None, truth: Volume | 
     truth = of_absorption(truth) if truth is not None and not reconstruction.delta_told else truth
     scores = score_object(found, scan, truth, reconstruction.oversample, found.backend, _factor(lit))
     told = {"delta_told": reconstruction.delta_told, "against": reconstruction.choice.against}
-    material = replace(material_found(found), **told)
+    material = replace(material_found(found, reconstruction.choice.matter), **told)
     said = held_out_verdict(reconstruction, scan, lit) if scan is not None else None
     return Evaluation(scores.test, scores.train, scores.volume, scores.predicted, material, said, lit)
 
@@ -300,18 +301,20 @@ def known(predicted: np.ndarray, measured: Scan) -> np.ndarray:
     return predicted if measured.missing is None else np.where(measured.missing, measured.frames, predicted)
 
 
-def material_found(found: Stored) -> MaterialFound:
-    """What the object, where δ and β are free, says about the matter; or the materials that it is made of."""
+def material_found(found: Stored, kind: MatterKind = "levels") -> MaterialFound:
+    """The materials that the object is made of, where they fill it; else what its volume says about the matter: where
+    δ and β are free, and where one material of continuous density is a unit of δ alone."""
     matter = found.matter
-    if matter.occupancies:
+    if matter.occupancies and not (matter.single and kind == "continuous"):
         return MaterialFound(matter.delta, matter.channels[0].ratio, matter.single, matter.others)
     volume = found.voxelise(found.enclosing_grid(MOST_VOXELS))
-    sign = matter.channels[0].sign
-    delta, beta = (sign * values.ravel().astype(np.float64) for values in (volume.delta, volume.beta))
-    level = _weighted_median(delta, delta)
-    matter = delta > 0.5 * level
-    ratio = _weighted_median(delta[matter] / np.maximum(beta[matter], 1e-30), delta[matter])
-    return MaterialFound(sign * level, ratio, False)
+    delta, beta = (values.ravel().astype(np.float64) for values in (volume.delta, volume.beta))
+    size, beta = np.abs(delta), np.sign(delta) * beta
+    level = _weighted_median(size, size)
+    dense = size >= 0.5 * level
+    ratio = _weighted_median(size[dense] / np.maximum(beta[dense], 1e-30), size[dense])
+    side = math.copysign(1.0, delta.sum())
+    return MaterialFound(side * level, matter.channels[0].ratio if matter.single else ratio, matter.single)
 
 
 def _as_text(delta: float, beta: float) -> str:

@@ -101,7 +101,10 @@ class Forecasted:
         """The numbers as a few lines of text."""
         step, last = self.forecast.times[0], self.forecast.times[-1]
         band = 1e6 * self.forecast.usual_band()
-        said = ["standard error of surfaces: not told, for that needs half-sets"]
+        said = [
+            "standard error of surfaces: not told, for that needs half-sets, for which the run has too few times, or "
+            "which --no-half-sets leaves out"
+        ]
         if np.isfinite(band).all():
             said = [f"standard error of surfaces: {band[0]:.3f} µm at {step:.4g} s, {band[-1]:.3f} µm at {last:.4g} s"]
         if self.decision is not None:

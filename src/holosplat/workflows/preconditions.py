@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import is_dataclass
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from ..checks import as_written, require
 from ..inference import Decision
 from ..io.atomic import read_json
 from ..io.provenance import sha256
+from ..matter import MaterialPrior
 from ..methods import Method, Task
 from ..methods.continued import Continued
 from ..methods.contrast import STAGE as SIGN
@@ -107,6 +109,17 @@ FLAT_LEVELS = (0.2, 5.0)
 """Between these lies the median of frames that are relative to the flat field."""
 MOST_NEGATIVE = 0.25
 """Share of the pixels that may be below zero: noise makes half of those so that an absorber darkens wholly."""
+
+
+def require_kinds(scan: Scan, prior: MaterialPrior, method: object) -> None:
+    """`InputError` for values of other types, such as the names that the command line takes."""
+    options = is_dataclass(method) and not isinstance(method, type)
+    for name, value, fits, wanted in (
+        ("scan", scan, isinstance(scan, Scan), "a Scan, as hs.read gives"),
+        ("prior", prior, isinstance(prior, MaterialPrior), "a MaterialPrior, such as MaterialPrior.known(δ and β)"),
+        ("method", method, options, "options of a method, such as Voxels() or preset('fast')"),
+    ):
+        require(fits, f"{name} must be {wanted}, but it is {value!r:.60}.")
 
 
 def require_one_time(scan: Scan) -> None:

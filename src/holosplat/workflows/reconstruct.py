@@ -37,6 +37,7 @@ from .preconditions import (
     decisions_of,
     goes_on,
     is_complete,
+    require_kinds,
     require_one_time,
 )
 from .provenance import environment, scan_hash
@@ -105,6 +106,7 @@ def reconstruct(
         >>> bool(abs(error) < 0.05)
         True
     """
+    require_kinds(scan, prior, method)
     if not method.of_series:
         require_one_time(scan)
     if not method.cones:

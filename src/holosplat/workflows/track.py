@@ -35,7 +35,7 @@ from ..representations import InMotion, MovingSurfaces, VoxelGrid
 from ..scan import Scan
 from ..tables import read_rows
 from .choice import Choice
-from .preconditions import check_frames, goes_on
+from .preconditions import check_frames, goes_on, require_kinds
 from .provenance import environment
 from .reconstruction import Reconstruction, config_of, write_rest, write_run
 from .run_folder import RunFolder, claimed
@@ -99,6 +99,7 @@ def track(
         >>> print(f"{(last - first)[1] / times[-1]:.2f} m/s")
         0.05 m/s
     """
+    require_kinds(scan, prior, options)
     scan.views.parallel("following motion")
     require(
         not isinstance(prior, KnownSeveral), "bodies are of one material, but several are known; give --material once."

@@ -269,13 +269,18 @@ def _is_fault(cause: Cause, size: float) -> bool:
 
 
 def _explained(found: Residuals, counts: np.ndarray) -> str:
-    residual, noise, contrast = (_rms(p, counts) for p in (found.residual, found.noise, found.contrast))
+    powers = found.residual, found.noise, found.contrast, found.allowed
+    residual, noise, contrast, allowed = (_rms(power, counts) for power in powers)
     if noise < NOISELESS * contrast:
         return (
             f"The frames are explained to {in_percent(residual / contrast)} of their contrast; their noise is below "
             f"{in_percent(NOISELESS)} of it."
         )
-    return f"The frames are explained to within their noise: the residual is {two_digits(residual / noise)} of it."
+    times = two_digits(residual / noise)
+    if residual > TOO_MUCH * noise:
+        of_both = f"{times} times the noise, {two_digits(residual / allowed)} of both"
+        return f"The frames are explained to within noise and model error: the residual is {of_both}."
+    return f"The frames are explained to within their noise: the residual is {times} of it."
 
 
 def _unexplained(found: Residuals, bad: np.ndarray, over: np.ndarray) -> str:
