@@ -4,8 +4,8 @@ loaded PyTorch and the rest: importing takes longer than most of these commands.
     python forked.py SOCKET
 
 serves them; a script `holosplat` in a folder of PATH hands a command over (`served`). Streams, folder, environment and
-exit code are the caller's, and signals reach the command. Torch takes one thread, as in other tests; with `UNDRAWN` in
-the environment, figures of reports are blank (`helpers.pictures`).
+exit code are the caller's, and signals reach the command. Torch takes one thread, as in other tests, and light is plain
+(`helpers.unjudged`); with `UNDRAWN` in the environment, figures of reports are blank (`helpers.pictures`).
 """
 
 from __future__ import annotations
@@ -64,12 +64,13 @@ def serve(path: str) -> None:
     import holosplat.report
     import holosplat.workflows.reconstruct  # noqa: F401 - loaded for the commands
     from helpers.pictures import undrawn
+    from helpers.unjudged import in_plain_light
     from holosplat.cli import main
 
     torch.set_num_threads(1)
     os.fsync = os.fstat  # what commands write need not survive a power cut
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # children leave no trace
-    with socket.socket(socket.AF_UNIX) as door:
+    with socket.socket(socket.AF_UNIX) as door, in_plain_light():
         door.bind(path)
         door.listen()
         print("ready", flush=True)
