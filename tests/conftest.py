@@ -207,6 +207,15 @@ def begun_once(memory: Once) -> Iterator[Once]:
         yield memory
 
 
+@pytest.fixture(scope="module")
+def plain_light(begun_once: Once) -> Iterator[None]:
+    """Runs compare no hypotheses about light, and share what they begin with; see `helpers.unjudged`."""
+    from helpers.unjudged import in_plain_light
+
+    with in_plain_light():
+        yield
+
+
 @pytest.fixture(scope="session")
 def espresso_rbc() -> Path:
     """Folder of simulated red cells in a channel (VTK files of other programs); skips where it is absent."""

@@ -46,7 +46,7 @@ OIL = Compound("C16H34", 0.77).delta_beta(20.0)
 BOTH = (SILICA, OIL)
 PRIOR = MaterialPrior.known(OIL, SILICA)
 EVEN = LightOptions("even", noise="white")
-pytestmark = pytest.mark.usefixtures("begun_once", "unjudged_runs")
+pytestmark = pytest.mark.usefixtures("plain_light", "unjudged_runs")
 
 
 def capsules(seed: int = 1) -> MeshScene:

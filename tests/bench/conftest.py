@@ -11,6 +11,7 @@ import holosplat as hs
 from helpers.bench_shop import Recorder
 from helpers.contract import PHOTOGRAPHS, two_balls
 from helpers.once import Once, once
+from helpers.unjudged import in_plain_light
 from holosplat_bench.suite.methods import METHODS
 
 
@@ -38,7 +39,7 @@ def decided(request) -> Iterator[None]:
     """All methods but those of photographs ask the same of the same frames: what their matter is, and what a first
     volume shows."""
     memory = Once()
-    with once(memory):
+    with once(memory), in_plain_light():
         yield
     asking = [name for name in METHODS if name not in PHOTOGRAPHS]
     here = [item.name for item in request.session.items if item.path == request.path]

@@ -15,7 +15,7 @@ from holosplat_bench.suite.folder import BenchFolder
 from holosplat_bench.suite.prepare import MEASURED
 from holosplat_bench.suite.run import chosen, run_suite
 
-pytestmark = pytest.mark.usefixtures("unjudged_runs")
+pytestmark = pytest.mark.usefixtures("unjudged_runs", "plain_light")
 
 # --- names and folders --------------------------------------------------------------------------------------
 

@@ -20,7 +20,7 @@ from holosplat_bench.suite.methods import METHODS
 from holosplat_bench.suite.prepare import MEASURED, agreement, missing_data
 from holosplat_bench.suite.run import Suite, run_suite
 
-pytestmark = pytest.mark.usefixtures("unjudged_runs")
+pytestmark = pytest.mark.usefixtures("unjudged_runs", "plain_light")
 
 SHAPE, COUNT, PIXEL, BETA = (3, 41), 96, 42.92e-6, 2e-10
 

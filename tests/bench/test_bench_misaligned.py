@@ -22,7 +22,7 @@ from holosplat_bench.suite.methods import ALIGNED, METHODS, by_mass, by_reprojec
 from holosplat_bench.suite.prepare import described, fingerprint
 from holosplat_bench.suite.run import Move, judged_with
 
-pytestmark = pytest.mark.usefixtures("unjudged_runs")
+pytestmark = pytest.mark.usefixtures("unjudged_runs", "plain_light")
 
 SHAPE = (31, 36)
 ERRORS = Misalignment(1.0, 0.6, 0.02, 5)

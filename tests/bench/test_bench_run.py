@@ -27,7 +27,7 @@ from holosplat_bench.suite.methods import REFERENCES
 from holosplat_bench.suite.prepare import fingerprint, prepared
 from holosplat_bench.suite.run import Suite, contrast_by_size, run_suite, stored_bytes
 
-pytestmark = pytest.mark.usefixtures("unjudged_runs")
+pytestmark = pytest.mark.usefixtures("unjudged_runs", "plain_light")
 
 # --- rows ---------------------------------------------------------------------------------------------------
 

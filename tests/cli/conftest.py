@@ -7,7 +7,6 @@ import json
 import pytest
 
 from helpers.cli import COLUMNS, PIXEL, QUICK, ROWS, Workshop, holosplat, known, simulate, worked
-from helpers.once import Once
 from holosplat.io.vtk import write_mesh
 from holosplat.specimens.red_cells import random_cells
 from holosplat.tables import to_table
@@ -34,5 +33,5 @@ def _undrawn(undrawn_reports: None) -> None:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _once(begun_once: Once) -> None:
-    """Commands in the tests' process share what runs begin with."""
+def _once(plain_light: None) -> None:
+    """Commands in the tests' process share what runs begin with, and take light for plain where nothing is told."""

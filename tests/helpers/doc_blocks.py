@@ -58,11 +58,20 @@ def run(page: str, folder: Path, readme: Path | None = None, shell: Path | None 
             run_block(block, folder, shell)
 
 
+FEW_STEPS = """import holosplat as hs
+hs.reconstruct = lambda scan, prior, method=hs.methods.Auto(), reconstruct=hs.reconstruct, **how: reconstruct(
+    scan, prior, method.with_effort(0.1), **how)
+"""
+"""What Python reads before a block."""
+
+
 def run_block(block: Block, folder: Path, shell: Path | None = None) -> None:
-    """Run a block in a folder; one that fails ends it with what it said. shell: a file that a shell reads before."""
+    """Run a block in a folder; one that fails ends it with what it said. shell: a file that a shell reads before;
+    with one, fits of Python take few steps, too."""
     words = ["bash", "-euo", "pipefail", "-c"] if block.language == "sh" else [sys.executable, "-c"]
+    before = FEW_STEPS if shell and block.language == "python" else ""
     env = _environment() | ({"BASH_ENV": str(shell)} if shell else {})
-    done = subprocess.run([*words, block.text], cwd=folder, env=env, capture_output=True, text=True)
+    done = subprocess.run([*words, before + block.text], cwd=folder, env=env, capture_output=True, text=True)
     assert done.returncode == 0, f"{block.text}\n{done.stdout[-2000:]}\n{done.stderr[-4000:]}"
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import holosplat as hs
 from holosplat.geometry import Views
 from holosplat.matter import DeltaBeta
+from holosplat.optics.background import LightOptions
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.carried import CarriedScene, Fades
 from holosplat.specimens.continuous import Bump, ContinuousScene, ellipsoid
@@ -16,6 +17,7 @@ from holosplat.specimens.continuous import Bump, ContinuousScene, ellipsoid
 PIXEL, SHAPE = 1e-6, (19, 23)
 MATTER = DeltaBeta(8e-7, 8e-10)
 TIMES = np.linspace(0.0, 1.0, 4)
+EVEN = LightOptions("even", still="none", noise="white")
 
 
 @dataclass(frozen=True)

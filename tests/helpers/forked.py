@@ -4,8 +4,9 @@ loaded PyTorch and the rest: importing takes longer than most of these commands.
     python forked.py SOCKET
 
 serves them; a script `holosplat` in a folder of PATH hands a command over (`served`). Streams, folder, environment and
-exit code are the caller's, and signals reach the command. Torch takes one thread, as in other tests; with `UNDRAWN` in
-the environment, figures of reports are blank (`helpers.pictures`).
+exit code are the caller's, and signals reach the command. Torch takes one thread, as in other tests, and light is plain
+(`helpers.unjudged`); with `UNDRAWN` in the environment, figures of reports are blank (`helpers.pictures`), and runs
+are not judged.
 """
 
 from __future__ import annotations
@@ -64,12 +65,18 @@ def serve(path: str) -> None:
     import holosplat.report
     import holosplat.workflows.reconstruct  # noqa: F401 - loaded for the commands
     from helpers.pictures import undrawn
+    from helpers.unjudged import in_plain_light, unjudged
     from holosplat.cli import main
+
+    @contextmanager
+    def blank() -> Iterator[None]:
+        with undrawn(), unjudged():
+            yield
 
     torch.set_num_threads(1)
     os.fsync = os.fstat  # what commands write need not survive a power cut
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # children leave no trace
-    with socket.socket(socket.AF_UNIX) as door:
+    with socket.socket(socket.AF_UNIX) as door, in_plain_light():
         door.bind(path)
         door.listen()
         print("ready", flush=True)
@@ -78,11 +85,11 @@ def serve(path: str) -> None:
             if os.fork() == 0:
                 door.close()
                 signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-                _command(caller, main, undrawn)
+                _command(caller, main, blank)
             caller.close()
 
 
-def _command(caller: socket.socket, main: Callable[[], None], undrawn: Blank) -> None:
+def _command(caller: socket.socket, main: Callable[[], None], blank: Blank) -> None:
     """Become the command of a caller, and tell it the exit code."""
     size, streams, *_ = socket.recv_fds(caller, 8, 3)
     words, folder, environment = json.loads(caller.recv(int.from_bytes(size, "big"), socket.MSG_WAITALL))
@@ -95,7 +102,7 @@ def _command(caller: socket.socket, main: Callable[[], None], undrawn: Blank) ->
     os.environ.update(environment)
     sys.argv, code = ["holosplat", *words], 1
     try:
-        with undrawn() if environment.get("UNDRAWN") else nullcontext():
+        with blank() if environment.get("UNDRAWN") else nullcontext():
             main()
         code = 0
     except SystemExit as end:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
@@ -24,6 +25,7 @@ MATTER = HAEMOGLOBIN.delta_beta(20.0)
 CELLS = random_cells(4, (30.5 * PITCH, 27.4 * PITCH, 30.5 * PITCH), 5, 13.7 * PITCH)
 
 
+@cache
 def scan_of(photons: float) -> Scan:
     """Sixteen views of cells of 14 pixels."""
     scene = MeshScene.of_one_material(CELLS, MATTER)

@@ -30,7 +30,7 @@ from holosplat.scan import Exposures, Scan
 from holosplat.specimens.red_cells import random_cells
 from holosplat.specimens.scene import MeshScene
 
-pytestmark = pytest.mark.usefixtures("unjudged_runs", "begun_once", "undrawn_reports")
+pytestmark = pytest.mark.usefixtures("unjudged_runs", "plain_light", "undrawn_reports")
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "adding.md"
 PIXEL = 3.2e-6

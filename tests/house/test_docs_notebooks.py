@@ -80,6 +80,7 @@ def test_links_of_a_notebook_lead_somewhere(path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("plain_light", "unjudged_runs", "quick_likelihood")
 @each
 def test_a_notebook_runs_offline(path, tmp_path, monkeypatch):
     """Its code in plain Python, in an empty folder; what its last lines give is shown as Jupyter would show it."""

@@ -19,7 +19,7 @@ from holosplat.io.volumes import read_volume
 from holosplat.io.vtk import read_meshes
 from holosplat.workflows.run_folder import RunFolder
 
-pytestmark = pytest.mark.usefixtures("begun_once", "unjudged_runs")  # but of what runs as a process
+pytestmark = pytest.mark.usefixtures("plain_light", "unjudged_runs")  # but of what runs as a process
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 

@@ -39,6 +39,8 @@ from holosplat.specimens.scene import MeshScene
 from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
 from holosplat.workflows.run_folder import RunFolder
 
+pytestmark = pytest.mark.usefixtures("plain_light")
+
 PITCH = 0.5e-6
 QUICK = CoarseToFine(columns=32, coarse_steps=15, last_steps=10, views=1, fit_steps=3)
 MATTER = HAEMOGLOBIN.delta_beta(20.0)

@@ -73,7 +73,7 @@ KNOWN = MaterialPrior.known(ONE.channels[0])
 PRIORS = {"known": KNOWN, "ratio": MaterialPrior.of_ratio(ONE.channels[0].ratio), "unknown": MaterialPrior.unknown()}
 
 
-pytestmark = pytest.mark.usefixtures("begun_once", "quick_likelihood")
+pytestmark = pytest.mark.usefixtures("plain_light", "quick_likelihood")
 
 
 @pytest.fixture(scope="module")

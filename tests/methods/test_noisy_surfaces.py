@@ -392,7 +392,7 @@ def test_surfaces_of_the_volume_explain_noisy_frames(noisy):
     assert error(found) < 0.25
 
 
-def test_a_run_ends_with_them(noisy, unjudged_runs):
+def test_a_run_ends_with_them(noisy, unjudged_runs, plain_light):
     """Gaussians of five steps explain nothing."""
     method = Surfaces(fit=HOW.fit, gaussians=OPTIONS)
     found = reconstruct(noisy.scan, noisy.prior, method, light=noisy.light, matter="levels").object

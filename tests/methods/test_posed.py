@@ -71,7 +71,8 @@ def guess(scan: hs.Scan, radius: float = 3.0e-6) -> Guessed:
 @pytest.fixture
 def short(monkeypatch):
     """Few steps, of a search and of fits."""
-    monkeypatch.setattr("holosplat.bodies.neighbourhood_search.PATIENCE", 1)
+    for name in ("PATIENCE", "TRIES"):
+        monkeypatch.setattr(f"holosplat.bodies.neighbourhood_search.{name}", 1)
     for name, steps in (("FIRST_STEPS", 120), ("TRIAL_STEPS", 60), ("LAST_STEPS", 60), ("ROUNDS", 2)):
         monkeypatch.setattr(method, name, steps)
 

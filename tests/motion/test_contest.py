@@ -91,7 +91,8 @@ def guessed(monkeypatch):
     trained = Trained(object(), Card(trained_on={"kinds": ["red-cells"]}))  # type: ignore[arg-type]
     monkeypatch.setattr("holosplat.learning.start.LearnedStart.network", property(lambda self: trained))
     monkeypatch.setattr(body_tracker.BodyTracker, "network", lambda self: trained.network)
-    monkeypatch.setattr("holosplat.bodies.neighbourhood_search.PATIENCE", 1)
+    for name in ("PATIENCE", "TRIES", "STEPS", "LAST_STEPS"):
+        monkeypatch.setattr(f"holosplat.bodies.neighbourhood_search.{name}", 1)
     return trained
 
 

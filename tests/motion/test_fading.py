@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import holosplat as hs
-from helpers.fading_lumps import MATTER, SHAPE, TIMES, Fades, drifting, series
+from helpers.fading_lumps import EVEN, MATTER, SHAPE, TIMES, Fades, drifting, series
 from holosplat.checks import InputError
 from holosplat.fit.flow_volume import FlowProblem, likelier_fading
 from holosplat.fit.smooth_volume import ContinuousPrior
@@ -62,13 +62,13 @@ def search(scan, spread: float) -> FlowSearch:
         most_cells=2,
         most_degree=0,
         steps=2,
-        iterations=12,
-        final=32,
-        most_final=32,
+        iterations=6,
+        final=16,
+        most_final=16,
         spacing_px=1.0,
         fading=spread,
     )
-    return FlowSearch(Task(scan, MaterialPrior.known(MATTER)), MATTER, how)
+    return FlowSearch(Task(scan, MaterialPrior.known(MATTER), light=EVEN), MATTER, how)
 
 
 def test_the_gradient_is_that_of_finite_differences():
@@ -100,18 +100,15 @@ def error(found: hs.volume.Volume, true: hs.volume.Volume) -> float:
     return float(np.linalg.norm(found.delta - true.delta) / np.linalg.norm(true.delta))
 
 
-@pytest.mark.parametrize(
-    ("way", "bound"), [((0.0, 0.0, 0.0), 0.75), ((4e-6, -2e-6, 3e-6), 0.85)], ids=["still", "drifting"]
-)
-def test_what_fades_is_reconstructed_better_where_it_may(way, bound, tmp_path):
-    """Half of the lumps' δ goes from the first time to the last; on rectangular frames of odd sides."""
-    scene, scan = series(drifting(way, Fades(0.5)), 5000.0)
+def test_what_fades_is_reconstructed_better_where_it_may(tmp_path):
+    """Half of the δ of lumps that drift goes from the first time to the last; on rectangular frames of odd sides."""
+    scene, scan = series(drifting(fades=Fades(0.5)), 5000.0)
     grid, errors = Grid.of_views(scan.views), []
     for spread in (0.0, 0.3):
         found = search(scan, spread).solve().object
         errors.append([error(found.at(t).voxelise(grid), scene.at(t).voxelise(grid)) for t in TIMES])
         assert (found.fading is None) == (spread == 0)
-    assert np.mean(errors[1]) < bound * np.mean(errors[0])
+    assert np.mean(errors[1]) < 0.85 * np.mean(errors[0])
     assert max(errors[1]) < max(errors[0])
     write_object(tmp_path / "object.h5", found)
     again = read_object(tmp_path / "object.h5")

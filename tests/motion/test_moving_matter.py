@@ -7,62 +7,33 @@ import pytest
 import torch
 
 import holosplat as hs
+from helpers import fading_lumps
+from helpers.fading_lumps import EVEN, MATTER, PIXEL, TIMES, series
 from holosplat.checks import InputError
 from holosplat.fit.flow_volume import FlowProblem, likelier_flow, strain
 from holosplat.fit.smooth_volume import ContinuousPrior
 from holosplat.fit.whitened import WhitenedFrames
-from holosplat.geometry import Grid, Views
-from holosplat.matter import DeltaBeta, MaterialPrior, Matter
+from holosplat.geometry import Grid
+from holosplat.matter import MaterialPrior, Matter
 from holosplat.methods import SmoothVolume, Task
 from holosplat.motion.flow_reconstruction import MOTION, STILL, FlowOptions, FlowSearch
 from holosplat.motion.timed_frames import merged, of_degree, on_lattice
 from holosplat.representations import Flow, Lattice, TimeBasis, VoxelGrid
-from holosplat.scan import Exposures, Scan
+from holosplat.scan import Scan
 from holosplat.specimens.carried import CarriedScene
-from holosplat.specimens.continuous import Bump, ContinuousScene, ellipsoid
 
-PIXEL = 1e-6
-MATTER = DeltaBeta(8e-7, 8e-10)
-TIMES = np.linspace(0.0, 1.0, 4)
 QUICK = SmoothVolume(coarser=(), rounds=1, iterations=8)
-
-
-class Drift:
-    """A uniform translation by `way` [m] a second."""
-
-    def __init__(self, way: tuple[float, float, float]) -> None:
-        self.way = np.array(way)[:, None]
-
-    def back(self, points: np.ndarray, time: float) -> np.ndarray:
-        return points - time * self.way
-
-    def forth(self, points: np.ndarray, time: float) -> np.ndarray:
-        return points + time * self.way
-
-
-def lumps(way: tuple[float, float, float]) -> CarriedScene:
-    """Three soft lumps that drift."""
-    places = [(-3e-6, -1e-6, 1e-6), (1e-6, 2e-6, -2e-6), (-1e-6, -2e-6, -3e-6)]
-    parts = tuple(ellipsoid(c, (3e-6, 2.4e-6, 2.7e-6), Bump(2), MATTER) for c in places)
-    return CarriedScene(ContinuousScene(parts), Drift(way), 10e-6, 4e-7)
-
-
-def series(way: tuple[float, float, float], photons: float = 800.0) -> tuple[CarriedScene, Scan]:
-    scene, views = lumps(way), Views.from_angles([0.0, 60.0, 110.0], (19, 23), PIXEL)
-    exposures = Exposures.of(views, 20.0, 0.1).repeated(TIMES)
-    nothing = np.zeros(len(exposures), dtype=bool)
-    return scene, hs.simulate(scene, exposures, photons_per_pixel=photons, seed=1, is_test=nothing, oversample=2)
 
 
 @pytest.fixture(scope="module")
 def drifting() -> tuple[CarriedScene, Scan]:
-    return series((4e-6, -2e-6, 3e-6))
+    return series(fading_lumps.drifting())
 
 
 def search(scan: Scan, **options: object) -> FlowSearch:
     usual = {"cells": 2, "most_degree": 0, "most_cells": 2, "steps": 2, "iterations": 6, "final": 16, "most_final": 24}
     how = FlowOptions(**{**usual, "volume": QUICK, "spacing_px": 1.0, **options})  # pyright: ignore[reportArgumentType]
-    return FlowSearch(Task(scan, MaterialPrior.known(MATTER)), MATTER, how)
+    return FlowSearch(Task(scan, MaterialPrior.known(MATTER), light=EVEN), MATTER, how)
 
 
 def error(found: hs.volume.Volume, true: hs.volume.Volume) -> float:
@@ -111,8 +82,8 @@ def test_steps_never_make_it_less_likely(drifting):
 
 def test_a_drift_is_found_and_all_times_are_better_than_each_by_itself():
     """In so few photons that single times hardly show the matter."""
-    scene, scan = series((4e-6, -2e-6, 3e-6), 300.0)
-    how = search(scan, iterations=10, final=24)
+    scene, scan = series(fading_lumps.drifting(), 300.0)
+    how = search(scan)
     found, grid = how.solve(), Grid.of_views(scan.views)
     moments = range(len(TIMES))
     own = [
@@ -149,7 +120,7 @@ def test_a_drift_is_said_to_move(drifting):
 
 
 def test_what_stands_still_is_not_said_to_move():
-    _, scan = series((0.0, 0.0, 0.0))
+    _, scan = series(fading_lumps.drifting((0.0, 0.0, 0.0)))
     how = search(scan)
     assert not how.moves(how.by_itself(merged(scan), "mean"))
     assert [(one.name, one.choice, one.by) for one in how.decisions] == [(MOTION, STILL, "frames set aside")]

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from helpers.once import Once, once
+from helpers.once import once
 from helpers.series import TIMES, Files, moving, planned
-from helpers.unjudged import unjudged
+from helpers.unjudged import in_plain_light, unjudged
 from holosplat.io.nxtomo import write_scan
 from holosplat.series.folder import SeriesFolder
 from holosplat.series.run import Counts, counted, run_left, states
@@ -28,7 +28,7 @@ def done(files, memory, tmp_path_factory) -> SeriesFolder:
     """A series of three tasks that are done; nobody changes it."""
     folder = planned(tmp_path_factory.mktemp("done") / "series", files.scan)
     assert counted(states(folder)) == Counts(0, 0, 0, 3)
-    with unjudged(), once(memory):
+    with unjudged(), once(memory), in_plain_light():
         assert run_left(folder) == Counts(3, 0, 0, 0)
     return folder
 
@@ -39,5 +39,5 @@ def _unjudged(unjudged_runs: None) -> None:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _once(begun_once: Once) -> None:
-    """All runs share what they begin with."""
+def _once(plain_light: None) -> None:
+    """All runs share what they begin with, and take light for plain where nothing is told."""

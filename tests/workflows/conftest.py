@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-from helpers.once import Once
 from helpers.runs import PIXEL, SHAPE, scene
 from holosplat.beamline.simulate import simulate
 from holosplat.geometry import Views
@@ -20,5 +19,5 @@ def scan() -> Scan:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _once(begun_once: Once) -> None:
-    """All runs share what they begin with."""
+def _once(plain_light: None) -> None:
+    """All runs share what they begin with, in light as they are told."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import reduce
+from functools import cache, reduce
 
 import numpy as np
 import pytest
@@ -23,6 +23,7 @@ WATER = hs.materials.parse_material("water").delta_beta(20.0)
 PRIOR, PIXEL, SHAPE = hs.MaterialPrior.known(WATER), 1e-6, (20, 23)
 
 
+@cache
 def scan_of(count: int, photons: float = 20000.0) -> hs.Scan:
     scene = hs.MeshScene.of_one_material(hs.specimens.random_cells(2, (16e-6, 16e-6, 16e-6), 5, 9e-6), WATER)
     exposures = hs.Exposures.of(hs.Views.evenly_spaced(count, SHAPE, PIXEL), 20.0, 0.03)

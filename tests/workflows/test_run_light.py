@@ -13,10 +13,13 @@ from holosplat.baselines import HolographicTV
 from holosplat.beamline.light import correlated_field
 from holosplat.beamline.simulate import simulate
 from holosplat.geometry import Grid, Views
+from holosplat.inference import Decision
 from holosplat.io.atomic import read_json
 from holosplat.matter import DeltaBeta, MaterialPrior, Matter
-from holosplat.methods import HolographicVoxels
+from holosplat.methods import HolographicVoxels, illumination
+from holosplat.methods.illumination import STAGE
 from holosplat.methods.per_view import PerView
+from holosplat.methods.trials import UNEVEN, name_of
 from holosplat.optics.background import LightOptions
 from holosplat.report.run import report_run
 from holosplat.representations import VoxelGrid
@@ -106,13 +109,20 @@ def test_what_a_folder_says_of_light():
     assert read_light_options(boxes, {"light": "uneven by 2.1%"}) == LightOptions("smooth", ((0, 9, 0, 9),))
 
 
-def test_a_run_finds_light_keeps_it_and_draws_it(tmp_path, undrawn_reports):
+def decide_for(patch: pytest.MonkeyPatch, *taken: str) -> None:
+    """These hypotheses are taken; what decides is tested in tests/methods/test_illumination.py."""
+    patch.setattr(illumination, "decided", lambda *how: (taken, ()))
+    patch.setattr(illumination, "confirmed", lambda *how: Decision(STAGE, name_of(taken), "told"))
+
+
+def test_a_run_finds_light_keeps_it_and_draws_it(tmp_path, undrawn_reports, monkeypatch):
+    decide_for(monkeypatch, UNEVEN, "fixed pattern")
     scan, _ = lit(6)
     scan = scan.cropped(slice(0, 45), slice(10, 58))
     pattern = 1 + 0.01 * np.random.default_rng(2).standard_normal(scan.views.shape)
     scan = replace(scan, frames=(scan.frames * pattern).astype(np.float32))
-    folder, quick = RunFolder(tmp_path / "run"), PerView("paganin", "sirt")
-    run = reconstruct(scan, MaterialPrior.known(MATTER), quick, folder=folder)
+    folder, quick = RunFolder(tmp_path / "run"), PerView("paganin", "fbp")
+    run = reconstruct(scan, MaterialPrior.known(MATTER), quick, folder=folder, matter="levels")
     assert run.light == SMOOTH
     assert load_reconstruction(folder).light == SMOOTH
     assert read_json(folder.summary)["light"].startswith("uneven")
@@ -124,13 +134,12 @@ def test_a_run_finds_light_keeps_it_and_draws_it(tmp_path, undrawn_reports):
 
 @pytest.mark.usefixtures("unjudged_runs")
 def test_light_in_common_is_kept_with_the_run_and_evaluated_in(tmp_path, monkeypatch):
-    """Where it was decided for: what decides is tested in tests/methods/test_illumination.py."""
-    monkeypatch.setattr("holosplat.methods.illumination.decided", lambda *how: (("fixed pattern",), ()))
+    decide_for(monkeypatch, "fixed pattern")
     scan, _ = lit(16, 0.0)
     pattern = 1 + 0.01 * np.random.default_rng(2).standard_normal(SHAPE)
     scan = replace(scan, frames=(scan.frames * pattern).astype(np.float32), is_test=np.arange(16) % 4 == 3)
     folder = RunFolder(tmp_path / "run")
-    run = reconstruct(scan, MaterialPrior.known(MATTER), PerView("paganin", "sirt"), folder=folder)
+    run = reconstruct(scan, MaterialPrior.known(MATTER), PerView("paganin", "fbp"), folder=folder, matter="levels")
     assert run.still is not None
     assert np.std(run.still / pattern) < 0.3 * np.std(pattern)
     again = load_reconstruction(folder)
@@ -153,6 +162,6 @@ def test_light_that_a_method_solves_for_is_kept_with_the_run():
     rows = np.cos(np.pi * (np.arange(SHAPE[0]) + 0.5) / SHAPE[0])
     scan = replace(scan, frames=(scan.frames * np.exp(0.03 * rows)[:, None]).astype(np.float32))
     method = HolographicVoxels(volume=HolographicTV(still_light=1, retrieval=20, iterations=40, upper=0.0))
-    run = reconstruct(scan, MaterialPrior.known(MATTER), method, light=LightOptions("even"))
+    run = reconstruct(scan, MaterialPrior.known(MATTER), method, light=LightOptions("even"), matter="levels")
     assert run.still is not None
     assert run.still == pytest.approx(np.broadcast_to(np.exp(0.03 * rows)[:, None], SHAPE), abs=0.01)

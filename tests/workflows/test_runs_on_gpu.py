@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from holosplat.baselines import HolographicTV
 from holosplat.fit.problem import Schedule
 from holosplat.matter import DeltaBeta, MaterialPrior, Matter
 from holosplat.methods import Auto, FitOptions, Gaussians, Method, solve
-from holosplat.methods.coarse import on_pixels
+from holosplat.methods.coarse import CoarseToFine, on_pixels
 from holosplat.methods.method import Task
 from holosplat.methods.volume import SmoothVolume
 from holosplat.optics.background import LightOptions
@@ -34,7 +35,12 @@ triton = pytest.importorskip("triton")
 
 KNOWN = MaterialPrior.known(DeltaBeta(two_balls.DELTA, two_balls.BETA))
 START = HolographicTV(retrieval=5, iterations=10, corrections=1, inner=2, settling=0, refine=1)
-GAUSSIANS = Gaussians(volume=START, approximate_steps=3, fit=FitOptions(schedule=Schedule(steps=3)))
+GAUSSIANS = Gaussians(
+    volume=START,
+    approximate_steps=3,
+    fit=FitOptions(schedule=Schedule(steps=3)),
+    coarse=CoarseToFine().with_effort(0.05),
+)
 AUTO = replace(Auto(gaussians=GAUSSIANS).with_effort(0.05), gaussians=GAUSSIANS)
 SMOOTH = SmoothVolume(volume=replace(START, upper=0.0), coarser=(), rounds=1, iterations=2)
 EVEN = LightOptions("even", still="none", noise="white")
@@ -84,10 +90,12 @@ def test_what_a_fit_ends_with_stays_where_it_was(on_gpu):
     assert all(isinstance(value, OnGpu) for value in result.parameters().values())
 
 
-@pytest.mark.parametrize("method", [GAUSSIANS, AUTO], ids=["Gaussians", "surfaces"])
-def test_a_run_folder_is_written_judged_and_read_again(method, on_gpu, tmp_path):
+@pytest.mark.parametrize(
+    ("method", "light"), [(GAUSSIANS, LightOptions()), (AUTO, EVEN)], ids=["Gaussians", "surfaces"]
+)
+def test_a_run_folder_is_written_judged_and_read_again(method, light, on_gpu, tmp_path):
     scan, folder = frames(), RunFolder(tmp_path / "run")
-    done = reconstruct(scan, KNOWN, method.on_backend("cuda"), folder=folder, matter="levels")
+    done = reconstruct(scan, KNOWN, method.on_backend("cuda"), folder=folder, matter="levels", light=light)
     assert folder.read_summary()["backend"] == "cuda"
     assert folder.read_summary()["device"] == "a pretended GPU"
     again = load_reconstruction(folder)
@@ -105,8 +113,9 @@ def test_a_run_goes_on_from_its_checkpoint(on_gpu, tmp_path):
             raise KeyboardInterrupt
 
     scan, folder, method = frames(), RunFolder(tmp_path / "run"), GAUSSIANS.on_backend("cuda")
-    assert not reconstruct(scan, KNOWN, method, folder=folder, matter="levels", on_progress=stop).finished
-    assert reconstruct(scan, KNOWN, method, folder=folder, matter="levels", resume=True).finished
+    run = partial(reconstruct, scan, KNOWN, method, folder=folder, matter="levels", light=EVEN)
+    assert not run(on_progress=stop).finished
+    assert run(resume=True).finished
 
 
 def test_a_run_that_finds_where_frames_are(on_gpu):
