@@ -13,7 +13,7 @@ import argparse
 import platform
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,7 @@ from machine import commit
 from rows import replaced, shown
 
 import holosplat as hs
+from holosplat.motion.elastic import Rest
 from holosplat.motion.forecast import Forecast, History, PathForecast
 from holosplat.motion.measures import early_part, half_sets
 from holosplat.motion.track import Followed, follow
@@ -61,10 +62,13 @@ class Row:
 
 def forecast_of(scan: hs.Scan, ahead: np.ndarray, seed: int) -> Forecast:
     """What the window `scan` says of the times `ahead` [s], with fits to its halves."""
-    bodies, times = follow(scan, MATERIAL, seed=seed).bodies, scan.instants
+    found, times = follow(scan, MATERIAL, seed=seed), scan.instants
+    bodies, rest = found.bodies, None
+    if found.rest is not None and found.body is not None:
+        rest = Rest.of(found.rest, found.body.stiffness, bodies.unit_length)
     early, start = early_part(scan, bodies, times)
-    halves = half_sets(scan, bodies, seed=seed), half_sets(scan[early], start, seed=seed)
-    return PathForecast().fit(History(bodies, times, *halves)).ahead(ahead)
+    halves = half_sets(scan, bodies, seed=seed, rest=rest), half_sets(scan[early], start, seed=seed, rest=rest)
+    return replace(PathForecast().fit(History(bodies, times, *halves)).ahead(ahead), rest=rest)
 
 
 def part(cells: MeshSeries, scan: hs.Scan, kept: slice) -> tuple[MeshSeries, hs.Scan]:

@@ -270,13 +270,16 @@ class BodyTracker:
 
     @property
     def rest(self) -> Rest | None:
-        """The known shape of the bodies."""
+        """The known shape of the bodies; of a forecast, of those that it has."""
+        if self.expected is not None:
+            return self.expected.rest
         body = self.options.body
         return None if body is None else at_rest(body, self.train.views.finest, self.size)
 
     def shape_at_rest(self) -> TriangleMesh | None:
-        """In metres."""
-        if (rest := self.rest) is None:
+        """In metres, where all bodies have it."""
+        others = self.expected is not None and self.bodies is not None and self.bodies.count > self.expected.count
+        if (rest := self.rest) is None or others:
             return None
         mesh = rest.elastic.membrane.mesh
         return TriangleMesh(self.train.views.finest * mesh.vertices, mesh.faces, "rest")
@@ -328,7 +331,7 @@ class BodyTracker:
 
     def told_from_twins(self, bodies: MovingSurfaces) -> MovingSurfaces:
         """`bodies` of known rest shape, or their twins, where there are two beams."""
-        if self.rest is None or not self.options.twins:
+        if self.rest is None or self.expected is not None or not self.options.twins:
             return bodies
         how = (self.options.stiff, self.options.soft, self.oversample, self.seed, self.light, self.run)
         trials = Trials(self.train, self.rest, *how)

@@ -102,19 +102,22 @@ class OfPaths(ABC):
 class RestShapeKept(OfPaths):
     """Σ over bodies of the mean over time of their elastic energy beside their rest shape."""
 
-    def __init__(self, weight: float, elastic: Elastic, start: MovingSurfaces) -> None:
-        """elastic: of a mesh in pixels, of which all bodies of `start` have the vertices, in its order."""
+    def __init__(self, weight: float, elastic: Elastic, start: MovingSurfaces, count: int | None = None) -> None:
+        """elastic: of a mesh in pixels, of which the first `count` bodies of `start`, or all, have the vertices, in its
+        order."""
         super().__init__("rest_shape", weight)
-        rest = elastic.membrane.rest
-        self._elastic, self._count = elastic, start.count
-        faces = torch.cat([rest.faces + k * len(elastic.membrane.mesh.vertices) for k in range(start.count)])
-        require(torch.equal(faces, start.faces), "bodies of a known rest shape must have its triangles.")
+        rest, nodes = elastic.membrane.rest, len(elastic.membrane.mesh.vertices)
+        self._elastic, self._count = elastic, count or start.count
+        self._nodes = self._count * nodes
+        faces = torch.cat([rest.faces + k * nodes for k in range(self._count)])
+        require(torch.equal(faces, start.faces[: len(faces)]), "bodies of a known rest shape must have its triangles.")
         instants = torch.linspace(start.basis.first, start.basis.last, start.basis.count + 1, dtype=torch.float64)
         self._weights = torch.from_numpy(start.basis.weights(instants.numpy()))
 
     def value(self, paths: Tensor, batch: Batch) -> Tensor:
         """As the class says."""
-        nodes = torch.einsum("tk,kpx->tpx", self._weights, paths).unflatten(1, (self._count, -1))
+        known = paths[:, : self._nodes]
+        nodes = torch.einsum("tk,kpx->tpx", self._weights, known).unflatten(1, (self._count, -1))
         return self._elastic(nodes).mean(0).sum()
 
 

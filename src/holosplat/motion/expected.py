@@ -14,7 +14,7 @@ from ..fit.problem import Batch
 from ..matter import Matter
 from ..mesh import TriangleMesh, across, areas, normals
 from ..representations import MovingSurfaces, TimeBasis
-from .elastic import OfPaths
+from .elastic import OfPaths, Rest
 from .forecast import Forecast, on_paths, places_of
 
 SAME_TIME = 1e-3
@@ -48,13 +48,15 @@ class Expected:
     """Where a forecast has bodies at the times of frames, and how surely.
 
     bodies: their triangles, unit and material; times: [T] s; places: of each body [T, P, 3] m; band: [T, B] m, standard
-    error of each surface along its normals (rms over it), which is taken to be one number at a time
+    error of each surface along its normals (rms over it), which is taken to be one number at a time;
+    rest: their shape at rest in this unit, None where it is not known
     """
 
     bodies: MovingSurfaces
     times: np.ndarray
     places: Sequence[np.ndarray]
     band: np.ndarray
+    rest: Rest | None = None
 
     @classmethod
     def of(cls, forecast: Forecast, times: np.ndarray, unit: float, matter: Matter) -> Expected:
@@ -68,7 +70,11 @@ class Expected:
             *(there.coefficients.detach() * (there.unit_length / unit), there.faces, there.of_body, there.basis),
             *(unit, matter, there.lines),
         )
-        return cls(bodies, times, places_of(bodies, within), band)
+        rest = forecast.rest
+        if rest is not None and unit != there.unit_length:
+            mesh = rest.elastic.membrane.mesh
+            rest = Rest.of(replace(mesh, vertices=there.unit_length * mesh.vertices), rest.stiffness, unit)
+        return cls(bodies, times, places_of(bodies, within), band, rest)
 
     @property
     def count(self) -> int:

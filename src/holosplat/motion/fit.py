@@ -105,7 +105,7 @@ def motion_fit(
             return QuasiNewton(leaves, smooth, options.pairs, worth)
         return Adam(leaves, "cpu", {COEFFICIENTS: group})
 
-    prior = (*_at_rest(base, start, rest), *_near(base, start, expected))
+    prior = (*_at_rest(base, start, rest, expected), *_near(base, start, expected))
     plan = Plan(
         problem=Problem(base.model, (base.frames, *_terms(base, start, options), *prior)),
         schedule=schedule,
@@ -143,10 +143,12 @@ def _terms(base: Ground, start: MovingSurfaces, options: MotionFit) -> list[Term
     return found
 
 
-def _at_rest(base: Ground, start: MovingSurfaces, rest: Rest | None) -> list[Term]:
+def _at_rest(base: Ground, start: MovingSurfaces, rest: Rest | None, expected: Expected | None) -> list[Term]:
+    """The prior of a shape at rest: of the bodies of a forecast alone, where that tells it."""
     if rest is None or rest.stiffness == 0:
         return []
-    return [RestShapeKept(rest.stiffness * _of_likelihood(base) * start.basis.count, rest.elastic, start)]
+    weight, count = rest.stiffness * _of_likelihood(base) * start.basis.count, expected and expected.count
+    return [RestShapeKept(weight, rest.elastic, start, count)]
 
 
 def _near(base: Ground, start: MovingSurfaces, expected: Expected | None) -> list[Term]:

@@ -14,6 +14,7 @@ from ..mesh import TriangleMesh, across, areas
 from ..ranges import ranged
 from ..representations import MovingSurfaces, TimeBasis
 from ..representations.flow import path_positions
+from .elastic import Rest
 from .split import Split, Window, shrunk
 
 Places = list[np.ndarray]
@@ -58,13 +59,15 @@ class Forecast:
     """A forecast after the last frames.
 
     bodies: on paths from the last frames' time on; times: [N] s of the forecast; band: [N, B] m, standard error of each
-    body's surface along its normals (rms over it), NaN where nothing tells it; told: numbers found on the way.
+    body's surface along its normals (rms over it), NaN where nothing tells it; told: numbers found on the way; rest: the
+    shape of all bodies at rest, where it is known.
     """
 
     bodies: MovingSurfaces
     times: np.ndarray
     band: np.ndarray
     told: dict[str, float] = field(default_factory=dict)
+    rest: Rest | None = None
 
     def usual_band(self) -> np.ndarray:
         """[N] m, the median over bodies."""

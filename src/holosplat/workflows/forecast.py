@@ -33,7 +33,7 @@ from ..tables import read_rows, to_table
 from .evaluate import render_object
 from .provenance import RUN, scan_hash
 from .reconstruct import load_reconstruction
-from .reconstruction import Reconstruction, summary_of
+from .reconstruction import Reconstruction, summary_of, write_rest
 from .run_folder import RunFolder
 from .run_illumination import light_of
 from .track import write_tracks
@@ -178,6 +178,7 @@ def forecast(
         found = way.fit(history).ahead(ahead)
     if history.halves is None:
         found = replace(found, band=np.full_like(found.band, np.nan))
+    found = replace(found, rest=run.rest)
     exposures = scan.exposures[last].repeated(ahead)
     frames = render_object(found.bodies, exposures, run.oversample, bodies.backend)
     predicted = Scan(frames, exposures, np.zeros(len(frames), dtype=bool), {"forecast": way.kind})
@@ -223,6 +224,9 @@ def write_forecast(folder: RunFolder, run: Reconstruction, found: Forecasted) ->
     said = found.forecast
     done = replace(run, object=said.bodies, method=ForecastOptions.kind, timing={}, verdict=None, total=None)
     write_object(folder.object, said.bodies, folder.marks())
+    if said.rest is not None:
+        mesh = said.rest.elastic.membrane.mesh
+        write_rest(folder, replace(mesh, vertices=said.bodies.unit_length * mesh.vertices))
     told = {"steps": 0, "times_s": said.times.tolist(), "bodies": said.bodies.count}
     folder.write_summary(summary_of(done, None, found.predicted) | told)
     write_scan(folder.path / FRAMES, found.predicted)
@@ -260,7 +264,8 @@ def read_forecast(folder: RunFolder) -> Forecast:
         f"a forecast must be a folder that holosplat forecast wrote, but {folder.path} holds no {TABLE}; forecast a "
         "run of track first.",
     )
-    return Forecast(tracked_bodies(load_reconstruction(folder)), *read_band(folder))
+    run = load_reconstruction(folder)
+    return Forecast(tracked_bodies(run), *read_band(folder), rest=run.rest)
 
 
 def config_of(options: ForecastOptions, scan: Scan, run: dict[str, Any], seed: int) -> dict[str, Any]:
