@@ -17,6 +17,7 @@ from holosplat.matter import DeltaBeta, Matter
 from holosplat.mesh import TriangleMesh, across, normals
 from holosplat.motion.body_tracker import BodyTracker
 from holosplat.motion.detections import joined, only
+from holosplat.motion.elastic import Rest, RestShapeKept
 from holosplat.motion.expected import Expected, NearExpected
 from holosplat.motion.forecast import Forecast
 from holosplat.motion.track import TrackOptions, follow
@@ -123,6 +124,31 @@ def test_its_pixels_and_material_are_those_of_the_frames():
     assert of.bodies.matter == Matter.one(3e-7, 1e-9)
     for ours, theirs in zip(of.places, expected(true_paths()).places):
         assert ours == pytest.approx(theirs)
+
+
+def test_the_shape_at_rest_goes_on_with_a_forecast():
+    """In pixels of other frames it is as large; bodies that the forecast lacks have other triangles, and none."""
+    mesh = truth().snapshots[2].meshes[0]
+    coarse = ellipsoid(0, 0.0, 2)
+    ahead = replace(forecast(only(true_paths(), [0])), rest=Rest.of(coarse, 7.0, PIXEL))
+    of = Expected.of(ahead, truth().times, 2 * PIXEL, Matter.one(*MATERIAL))
+    assert of.rest is not None
+    assert of.rest.stiffness == 7.0
+    assert 2 * PIXEL * of.rest.elastic.membrane.mesh.vertices == pytest.approx(coarse.vertices)
+    start = of.on(true_paths().basis)
+    path = np.repeat(mesh.vertices[None], start.basis.count, 0)
+    other = MovingSurfaces.of_bodies([path], [mesh.faces], start.basis, 2 * PIXEL, start.matter)
+    alone = RestShapeKept(1.0, of.rest.elastic, start)
+    both = joined(start, other)
+    beside = RestShapeKept(1.0, of.rest.elastic, both, of.count)
+    assert float(beside.value(both.coefficients, UNUSED)) == pytest.approx(
+        float(alone.value(start.coefficients, UNUSED))
+    )
+    run = BodyTracker(scan(), MATERIAL, TrackOptions(), 0, None, Run(), lambda *_: None, of)
+    run.bodies = start
+    assert run.shape_at_rest() is not None
+    run.bodies = both
+    assert run.shape_at_rest() is None
 
 
 def off(bodies: MovingSurfaces) -> float:

@@ -59,8 +59,8 @@ class Forecast:
     """A forecast after the last frames.
 
     bodies: on paths from the last frames' time on; times: [N] s of the forecast; band: [N, B] m, standard error of each
-    body's surface along its normals (rms over it), NaN where nothing tells it; told: numbers found on the way; rest: the
-    shape of all bodies at rest, where it is known.
+    body's surface along its normals (rms over it), NaN where nothing tells it; told: numbers found on the way; rest:
+    the shape of all bodies at rest, where it is known.
     """
 
     bodies: MovingSurfaces

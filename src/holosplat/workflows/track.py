@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..bodies.rest_shape import KnownBody
 from ..checks import as_written, require
 from ..fit.residuals import Prediction
 from ..fit.run import Run
@@ -162,9 +163,10 @@ def _in_motion(
 
 
 def _rest(found: Followed) -> Rest | None:
-    if found.rest is None or found.body is None:
+    if found.rest is None:
         return None
-    return Rest.of(found.rest, found.body.stiffness, found.bodies.unit_length)
+    stiffness = KnownBody.stiffness if found.body is None else found.body.stiffness  # as `read_rest` has it
+    return Rest.of(found.rest, stiffness, found.bodies.unit_length)
 
 
 def _more(found: Followed, scan: Scan) -> dict[str, np.ndarray]:
