@@ -69,7 +69,7 @@ def decide_matter(task: Task, methods: Mapping[MatterKind, Method] | None = None
         if methods is None or sure:
             return found
     for effort in (EFFORT, 1.0):
-        kinds = {kind: method.with_effort(effort) for kind, method in methods.items()}
+        kinds: dict[MatterKind, Method] = {kind: one.with_effort(effort) for kind, one in methods.items()}
         fits = TrialFits(task, first, kinds, whole=effort == 1.0)
 
         def scored(name: str, fold: int, fits: TrialFits = fits) -> Score:
