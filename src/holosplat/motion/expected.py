@@ -90,7 +90,7 @@ class Expected:
 
         It has half the information, about places that are one standard error off to that side, by a random field of
         second order; `bodies` begin as far off. So half the difference of the halves has the variance 1/(p + 1/s²) of
-        frames of information p and a forecast of standard error s, and s where frames say nothing.
+        frames of information p and a forecast of standard error s: the forecast's own where p is 0.
         """
         draws, places, begun = np.random.default_rng([seed, 2]), list(self.places), places_of(bodies, self.times)
         for k, (own, error) in enumerate(zip(self.places, self.band.T)):
