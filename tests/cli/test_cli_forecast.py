@@ -26,7 +26,8 @@ from holosplat.motion.measures import half_sets
 from holosplat.motion.track import Followed
 from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.specimens.red_cells import icosphere
-from holosplat.workflows.forecast import read_band
+from holosplat.workflows.forecast import read_band, read_forecast
+from holosplat.workflows.reconstruction import write_rest
 from holosplat.workflows.run_folder import RunFolder
 
 AHEAD, TIMES = 2, 10
@@ -199,6 +200,19 @@ def test_later_frames_correct_a_forecast(folder):
     bodies = [read_object(folder / name / "object.h5") for name in ("corrected", "later")]
     for ours, theirs in zip(*(of.bodies(STEP * (TIMES - 1)) for of in bodies if isinstance(of, MovingSurfaces))):
         assert ours.vertices.mean(0) == pytest.approx(theirs.vertices.mean(0), abs=0.1 * PIXEL)
+
+
+def test_a_forecast_keeps_the_shape_at_rest(folder):
+    """That of the run, which then holds for the frames that correct it."""
+    run, out, shape = folder / "of known shape", folder / "shaped", ellipsoid(0, 0.0, 2)
+    shutil.copytree(folder / "run", run)
+    write_rest(RunFolder(run), shape)
+    with undrawn():
+        worked_by("forecast", run, "--times", 1, "--by", "paths", *SHORT, "--out", out)
+    kept = read_forecast(RunFolder(out)).rest
+    assert kept is not None
+    assert PIXEL * kept.elastic.membrane.mesh.vertices == pytest.approx(shape.vertices, abs=1e-11)
+    assert read_forecast(RunFolder(folder / "later")).rest is None
 
 
 def test_only_a_forecast_that_reaches_over_the_frames_is_taken(folder):

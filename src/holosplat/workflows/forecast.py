@@ -276,6 +276,7 @@ def config_of(options: ForecastOptions, scan: Scan, run: dict[str, Any], seed: i
             **{
                 "kind": options.kind,
                 "of": run.get(RUN, ""),
+                "body": run["method"].get("body"),
                 "forecast": "auto" if options.decides else options.way.kind,
             },
             **to_table(options),

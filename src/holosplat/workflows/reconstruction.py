@@ -201,7 +201,7 @@ def read_rest(folder: RunFolder, found: Stored, config: dict[str, Any]) -> Rest 
     if not (isinstance(found, MovingSurfaces) and folder.rest.is_file()):
         return None
     with as_written(folder.config, "what track wrote"):
-        told = config["method"].get("body")  # None where red cells were found, and of a forecast
+        told = config["method"]["body"]  # None where red cells were found
         stiffness = KnownBody.stiffness if told is None else float(told["stiffness"])
     shape = read_meshes(folder.rest, LENGTH_UNIT)[0]
     own = [found.body(k)[1].numpy() for k in range(found.count)]
