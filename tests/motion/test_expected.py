@@ -15,7 +15,7 @@ from holosplat.fit.problem import Batch
 from holosplat.fit.run import Run
 from holosplat.matter import DeltaBeta, Matter
 from holosplat.mesh import TriangleMesh, across, normals
-from holosplat.motion.body_tracker import BodyTracker
+from holosplat.motion.body_tracker import BodyTracker, Followed
 from holosplat.motion.detections import joined, only
 from holosplat.motion.elastic import Rest, RestShapeKept
 from holosplat.motion.expected import Expected, NearExpected
@@ -189,6 +189,26 @@ def test_where_frames_say_nothing_the_forecast_stands():
         halves = [np.stack([of.bodies(float(t))[k].vertices for t in said.times]) for of in (one, other)]
         half = 0.5 * across(*halves, faces)
         assert np.sqrt(np.mean(half**2)) == pytest.approx(np.sqrt(np.mean(said.band[:, k] ** 2)), rel=0.35)
+
+
+def test_two_beams_give_a_forecast_up_where_they_show_more_without_it(monkeypatch):
+    """Bodies two pixels away against the true ones; and the true ones against themselves, where the forecast stays."""
+    right, away = true_paths(), torch.zeros(3)
+    away[1] = 2.0
+    wrong = right.with_parameters({"coefficients": right.coefficients + away})
+    views = np.flatnonzero(np.isin(np.arange(len(scan())) % 4, (0, 2)))
+
+    def found(run: BodyTracker) -> Followed:
+        return Followed(wrong if run.expected is not None and astray else right, [], 2, {}, (3,), moved=1.0)
+
+    monkeypatch.setattr(BodyTracker, "until", lambda run, stage: None)
+    monkeypatch.setattr(BodyTracker, "followed", found)
+    options = TrackOptions(cells=False)
+    for astray, frames, choice in ((True, views, "none"), (False, views, "a forecast"), (True, None, None)):
+        seen = scan() if frames is None else scan()[frames]
+        kept = follow(seen, MATERIAL, options, after=forecast(right))
+        assert [each.choice for each in kept.decisions] == [choice] * (choice is not None)
+        assert kept.bodies is (wrong if astray and frames is None else right)
 
 
 def test_bodies_of_a_forecast_stay():

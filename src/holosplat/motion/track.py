@@ -15,6 +15,7 @@ from ..inference import Score, select
 from ..matter import DeltaBeta, Matter
 from ..optics.background import Light
 from ..progress import FitProgress
+from ..representations import MovingSurfaces
 from ..scan import Scan
 from .body_tracker import BodyTracker, Followed, require_times
 from .detections import predicted
@@ -23,6 +24,7 @@ from .forecast import Forecast
 from .track_linking import TrackOptions
 
 NAME, CELLS, ANY = "shape of the bodies", "red cells", "any shape"
+PRIOR, AFTER, ALONE = "prior of the paths", "a forecast", "none"
 
 
 def compared_kinds(cells: BodyTracker, other: BodyTracker) -> Followed:
@@ -48,10 +50,28 @@ def compared_kinds(cells: BodyTracker, other: BodyTracker) -> Followed:
     return kept.followed()
 
 
+def compared_priors(train: Scan, corrected: Followed, alone: Followed) -> Followed:
+    """What `corrected`, of a forecast, found; or what frames of two beams show `alone`, where that leaves less of them
+    by the policy of `select`: these leave shapes open, which a wrong forecast then keeps."""
+    both = {AFTER: corrected, ALONE: alone}
+
+    def scored(name: str, fold: int) -> Score:
+        return residual(train, both[name].bodies, both[name].oversample)
+
+    decision = select(PRIOR, tuple(both), scored, by="training frames")
+    kept = both[decision.choice]
+    return replace(kept, decisions=(*kept.decisions, decision))
+
+
 def unexplained(of: BodyTracker) -> Score:
     """The residual of the training frames beside the frames of the bodies."""
     assert of.bodies is not None
-    return Score.of(torch.from_numpy(of.train.frames - predicted(of.train, of.bodies, of.oversample)))
+    return residual(of.train, of.bodies, of.oversample)
+
+
+def residual(train: Scan, bodies: MovingSurfaces, oversample: int) -> Score:
+    """What `bodies` leave of the frames `train`."""
+    return Score.of(torch.from_numpy(train.frames - predicted(train, bodies, oversample)))
 
 
 def require_prior(after: Forecast | None, options: TrackOptions, times: np.ndarray) -> None:
@@ -84,28 +104,41 @@ def follow(
     """The bodies of `material` in the training frames of `scan`, of several times.
 
     after: the forecast of these times by earlier ones, with which the bodies begin, and from which frames draw them as
-    far as its standard errors allow; light: of the training frames, which were divided by it, where it is uneven.
-    journal: keeps every stage that is done, and fits from time to time; what it holds already is not done again, and
-    the result is the same bit for bit. Where all frames are of two beams, of unknown shape, and a network of red cells
-    guesses the bodies, they are followed as red cells, too; these are kept unless bodies of any shape leave less
-    (`compared_kinds`). Errors: `InputError` for a scan of one time, where no body is seen, and for a forecast that does
-    not reach over the times, has no standard errors, or is given beside a shape at rest.
+    far as its standard errors allow; of two beams, unless these show more without it (`compared_priors`). light: of the
+    training frames, which were divided by it, where it is uneven. journal: keeps every stage that is done, and fits
+    from time to time; what it holds already is not done again, and the result is the same bit for bit. Where all frames
+    are of two beams, of unknown shape, and a network of red cells guesses the bodies, they are followed as red cells,
+    too; these are kept unless bodies of any shape leave less (`compared_kinds`). Errors: `InputError` for a scan of one
+    time, where no body is seen, and for a forecast that does not reach over the times, has no standard errors, or is
+    given beside a shape at rest.
     """
     train = scan.train()
     require_times(train)
     run = Run(journal)
+    require_prior(after, options, train.instants)
 
-    def tracker(name: str, body: KnownBody | None) -> BodyTracker:
+    def tracker(name: str, body: KnownBody | None, expected: Expected | None = None) -> BodyTracker:
         how = replace(options, body=body)
         return BodyTracker(train, material, how, seed, light, run.part(name), on_progress, expected)
 
-    require_prior(after, options, train.instants)
-    pixel, matter = train.views.finest, Matter.one(*material)
-    expected = after and Expected.of(after, train.instants, pixel, matter)
-    every = tracker("any", options.body)
-    if expected is None and options.body is None and options.cells and two_beams(train.views) is not None:
-        every.until("first paths")
-        if every.cells > 0:
-            return compared_kinds(tracker("cells", guessed_cells(every.cells)), every)
-    every.until("done")
-    return every.followed()
+    def alone() -> Followed:
+        every = tracker("any", options.body)
+        if options.body is None and options.cells and two_beams(train.views) is not None:
+            every.until("first paths")
+            if every.cells > 0:
+                return compared_kinds(tracker("cells", guessed_cells(every.cells)), every)
+        every.until("done")
+        return every.followed()
+
+    if after is None:
+        return alone()
+    expected = Expected.of(after, train.instants, train.views.finest, Matter.one(*material))
+    corrected = tracker("after", None, expected)
+    corrected.until("done")
+    found = corrected.followed()
+    if two_beams(train.views) is None:
+        return found
+    try:
+        return compared_priors(train, found, alone())
+    except InputError:  # frames alone show no body
+        return found

@@ -129,7 +129,7 @@ def track(
                 write_rest(folder, found.rest)
             told = {"steps": len(found.records), "times_s": task.scan.instants.tolist(), "bodies": found.bodies.count}
             told |= {"bodies_at_each_time": list(found.found)}
-            told |= {} if after is None else {"moved_from_forecast": found.moved}
+            told |= {} if np.isnan(found.moved) else {"moved_from_forecast": found.moved}
             write_run(folder, done, task, None, told)
             write_tracks(folder, found.bodies, scan, _more(found, scan))
         return done
