@@ -132,6 +132,13 @@ class Slow(Answer):
 
     later: Stored
     steps: list[float] = field(default_factory=list, compare=False)
+    join_missing: bool = True
+    joined: set[tuple[bool, bool]] = field(default_factory=set, compare=False)
+    """Whether fits were long, and whether missing bodies join in them."""
+
+    def start(self, task, before):
+        self.joined.add((self.found is self.later, self.join_missing))
+        return super().start(task, before)
 
     def with_effort(self, effort: float) -> Slow:
         self.steps.append(effort)
@@ -149,6 +156,7 @@ def test_levels_that_short_fits_do_not_find_have_long_ones(soft, short, efforts)
     levels = Slow(bad, good)
     assert decide_matter(task, {"levels": levels, "continuous": Answer(fair)}).choice == "one level"
     assert levels.steps == efforts
+    assert levels.joined == {(effort == 1, effort == 1) for effort in efforts}  # short ones do without
 
 
 def test_fits_alone_overturn_a_known_material(soft):

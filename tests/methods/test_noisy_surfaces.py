@@ -36,6 +36,7 @@ from holosplat.representations import SurfaceMesh
 from holosplat.scan import Exposures
 from holosplat.specimens.red_cells import icosphere
 from holosplat.specimens.scene import MeshScene
+from holosplat.tables import with_entries
 from holosplat.workflows.reconstruct import reconstruct
 
 OPTIONS = Gaussians(
@@ -326,6 +327,12 @@ def test_few_views_are_judged_by_data_fission(noisy, views, monkeypatch):
     found, _ = best_cut(task, 2)
     assert (told[-1].name, told[-1].choice, told[-1].by, told[-1].compared[0].least) == (BODIES, MORE, BY_FISSION, 0.0)
     assert torch.equal(found.vertices, mesh_of(4).vertices)
+
+
+def test_none_are_looked_for_where_none_shall_join(noisy, monkeypatch):
+    monkeypatch.setattr("holosplat.methods.surfaces.begun_surfaces", lambda *given: None)
+    monkeypatch.setattr("holosplat.methods.surfaces.with_missing_bodies", lambda *given: pytest.fail("not asked for"))
+    best_cut(noisy, 4, with_entries(EXPLAINED, {"join_missing": False}))
 
 
 @pytest.mark.parametrize("count", [2, 4], ids=["that lack much", "that lack nothing"])

@@ -14,9 +14,8 @@ from ..io.formats import read_frames, run_reading, run_source
 from ..io.reading import Reading, Told, ends_of
 from ..motion.cell_model import ChannelFrame
 from ..motion.dynamics import DynamicsForecast
-from ..motion.expected import SAME_TIME
 from ..motion.fit import MotionFit
-from ..motion.forecast import PathForecast
+from ..motion.forecast import SAME_TIME, PathForecast
 from ..motion.learned import GraphForecast
 from ..motion.modes import DmdForecast, SindyForecast
 from ..planning.acts import of_forecast

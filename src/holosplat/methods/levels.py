@@ -119,7 +119,8 @@ class TrialFits:
 
     They start from volumes on voxels of a pixel, as first ones are. Two levels alone need no ratio δ/β; else it is,
     where nothing is known, the likeliest one, as in a run; before light is decided, that of the first volume. whole:
-    whether bodies that surfaces lack join them; without these bodies predict unseen frames no better, and cost half.
+    whether bodies that surfaces lack join them. These join only where they predict unseen frames better, so that fits
+    without them that speak for levels are enough; they cost half.
     """
 
     def __init__(

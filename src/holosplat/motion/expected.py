@@ -15,10 +15,7 @@ from ..matter import Matter
 from ..mesh import TriangleMesh, across, areas, normals
 from ..representations import MovingSurfaces, TimeBasis
 from .elastic import OfPaths, Rest
-from .forecast import Forecast, on_paths, places_of
-
-SAME_TIME = 1e-3
-"""Share of a step within which two times are one."""
+from .forecast import SAME_TIME, Forecast, on_paths, places_of
 
 
 def second_order_field(draws: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:

@@ -21,6 +21,8 @@ Places = list[np.ndarray]
 """Of each body the places [T, P, 3] [m] of its vertices."""
 Halves = tuple[MovingSurfaces, MovingSurfaces]
 """The same bodies by two halves of the frames."""
+SAME_TIME = 1e-3
+"""Share of a step within which two times are one."""
 SMOOTH = 3
 """Degree of the paths between the times of a forecast."""
 

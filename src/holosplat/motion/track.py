@@ -139,6 +139,7 @@ def follow(
     if two_beams(train.views) is None:
         return found
     try:
-        return compared_priors(train, found, alone())
-    except InputError:  # frames alone show no body
-        return found
+        other = alone()
+    except InputError as error:
+        return replace(found, begun=f"{found.begun}; without the forecast: {error}")
+    return compared_priors(train, found, other)

@@ -19,8 +19,7 @@ from ..methods.presets import SCHEMA
 from ..metrics import image_scores, intensity_range
 from ..motion.assimilate import carry_by_frames
 from ..motion.dynamics import DynamicsForecast, HybridForecast, window_of
-from ..motion.expected import SAME_TIME
-from ..motion.forecast import Forecast, Forecaster, Halves, History, PathForecast, decided
+from ..motion.forecast import SAME_TIME, Forecast, Forecaster, Halves, History, PathForecast, decided
 from ..motion.learned import GraphForecast, read_dynamics
 from ..motion.measures import early_part, half_fit, half_sets
 from ..motion.modes import DmdForecast, SindyForecast
