@@ -19,6 +19,7 @@ from holosplat.motion.body_tracker import BodyTracker, Followed
 from holosplat.motion.detections import joined, only
 from holosplat.motion.elastic import Rest, RestShapeKept
 from holosplat.motion.expected import Expected, NearExpected
+from holosplat.motion.fit import fitted_bodies, motion_fit
 from holosplat.motion.forecast import Forecast
 from holosplat.motion.track import TrackOptions, follow
 from holosplat.representations import MovingSurfaces
@@ -174,6 +175,25 @@ def test_frames_correct_a_forecast_and_show_what_it_lacks():
     assert off(found.bodies) < 0.25 * off(joined(ahead, only(true_paths(), [2])))
     assert 0.2 < found.moved < 5
     assert "standard errors of the forecast" in found.begun
+
+
+def test_a_fit_is_drawn_to_the_forecast():
+    """Of frames that show nothing, from a pixel beside it; without the prior, bodies stay there."""
+    of = replace(expected(true_paths()), band=np.full((len(truth().times), 3), 0.1 * PIXEL))
+    faint, start = Matter.one(1e-6 * MATERIAL.delta, 1e-6 * MATERIAL.beta), of.on(true_paths().basis)
+    way = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    beside = MovingSurfaces(start.coefficients + way, start.faces, start.of_body, start.basis, PIXEL, faint)
+    how = replace(TrackOptions().soft, objective=replace(TrackOptions().soft.objective, bending=0.0))
+    before, drawn, left = (
+        of.deviation(each)
+        for each in (
+            beside,
+            fitted_bodies(motion_fit(scan(), beside, how, expected=of)),
+            fitted_bodies(motion_fit(scan(), beside, how)),
+        )
+    )
+    assert drawn < 0.2 * before
+    assert left > 0.8 * before
 
 
 def test_where_frames_say_nothing_the_forecast_stands():
