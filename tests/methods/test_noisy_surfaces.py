@@ -1,5 +1,4 @@
-"""Closed bodies in small noisy frames: where Gaussians explain these badly, surfaces of the volume that agrees with the
-frames may take their place."""
+"""Closed bodies in small noisy frames: where Gaussians explain these badly, surfaces of a volume may take their place."""
 
 from __future__ import annotations
 
@@ -329,17 +328,11 @@ def test_few_views_are_judged_by_data_fission(noisy, views, monkeypatch):
     assert torch.equal(found.vertices, mesh_of(4).vertices)
 
 
-def test_none_are_looked_for_where_none_shall_join(noisy, monkeypatch):
-    monkeypatch.setattr("holosplat.methods.surfaces.begun_surfaces", lambda *given: None)
+@pytest.mark.parametrize(("count", "joins"), [(2, True), (4, True), (4, False)])
+def test_large_frames_get_none_and_small_ones_where_none_shall_join(noisy, count, joins, monkeypatch):
     monkeypatch.setattr("holosplat.methods.surfaces.with_missing_bodies", lambda *given: pytest.fail("not asked for"))
-    best_cut(noisy, 4, with_entries(EXPLAINED, {"join_missing": False}))
-
-
-@pytest.mark.parametrize("count", [2, 4], ids=["that lack much", "that lack nothing"])
-def test_large_frames_get_none(noisy, count, monkeypatch):
-    monkeypatch.setattr("holosplat.methods.surfaces.with_missing_bodies", lambda *given: pytest.fail("not asked for"))
-    monkeypatch.setattr(BodiesStage, "_small", lambda *given: False)
-    found, _ = best_cut(noisy, count)
+    monkeypatch.setattr(BodiesStage, "_small", lambda *given: not joins)
+    found, _ = best_cut(noisy, count, with_entries(EXPLAINED, {"join_missing": joins}))
     assert torch.equal(found.vertices, mesh_of(count).vertices)
 
 
