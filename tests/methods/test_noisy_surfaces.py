@@ -1,4 +1,4 @@
-"""Closed bodies in small noisy frames: where Gaussians explain these badly, surfaces of a volume may take their place."""
+"""Small noisy frames of closed bodies: where Gaussians explain these badly, surfaces of a volume take their place."""
 
 from __future__ import annotations
 
