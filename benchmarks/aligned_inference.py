@@ -21,8 +21,8 @@ from rows import write
 from torch import Tensor
 
 from holosplat.geometry import Grid, Views
-from holosplat.representations import AlignedNetwork, PixelAligned
-from holosplat.representations.pixel_aligned import places_of
+from holosplat_bench.opponents.fields import AlignedNetwork, PixelAligned
+from holosplat_bench.opponents.fields.pixel_aligned import places_of
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "data" / "aligned_inference.csv"
 EDGE, ACROSS, PIECE = 128, 80, 1 << 16

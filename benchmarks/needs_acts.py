@@ -28,19 +28,19 @@ from holosplat.beamline.simulate import Simulation
 from holosplat.cli.learn import _needs
 from holosplat.geometry import Views
 from holosplat.io.vtk import write_mesh
-from holosplat.learning.network import Size
 from holosplat.mesh import TriangleMesh
-from holosplat.methods import METHODS, Gaussians, Pinn, SurfaceOptions
+from holosplat.methods import METHODS, Gaussians, SurfaceOptions
 from holosplat.motion.fit import MotionFit
 from holosplat.motion.flow_reconstruction import FlowOptions
 from holosplat.motion.track_linking import TrackOptions
 from holosplat.planning import acts
-from holosplat.planning.needs import Needs, of_reconstruction
+from holosplat.planning.needs import Needs, of_fit, of_reconstruction
 from holosplat.planning.needs import Sizes as NeedsSizes
 from holosplat.scan import Exposures
 from holosplat.specimens.membrane.rest import nodes_of
 from holosplat.specimens.red_cells import random_cells
-from holosplat.training.options import Ranges
+from holosplat.training.options import Ranges, TrainOptions
+from holosplat.training.train import trainer_of
 from holosplat_bench.suite.case import planned_frames
 from holosplat_bench.suite.methods import METHODS as BENCH_METHODS
 from holosplat_bench.suite.methods import of_methods
@@ -225,7 +225,8 @@ def said_of_dataset(sizes: Sizes) -> Needs:
 
 def said_of_training(network: str) -> Callable[[Sizes], Needs]:
     """Of a network."""
-    return lambda sizes: acts.of_training((sizes["rows"], sizes["columns"]), sizes["views"], network, Size(), 6)
+    how, needs = TrainOptions(network=network, steps=6), trainer_of(network).needs
+    return lambda sizes: needs((sizes["rows"], sizes["columns"]), sizes["views"], how)
 
 
 def said_of_start(sizes: Sizes) -> Needs:
@@ -246,6 +247,13 @@ def said_of_method(method: str) -> Callable[[Sizes], Needs]:
     return said
 
 
+def said_of_series(sizes: Sizes) -> Needs:
+    """Of a method of all times."""
+    needs = of_fit(NeedsSizes.of(frames(sizes)), METHODS["pinn"])
+    assert needs is not None
+    return needs
+
+
 def said_of_growth(sizes: Sizes) -> Needs:
     """Of cells in flow."""
     return acts.of_growth(sizes["cells"], nodes_of(sizes["frequency"]), sizes["snapshots"], 5e-9)
@@ -261,7 +269,7 @@ ACTS: dict[str, tuple[Callable[[Path, Sizes], list[object]], Callable[[Sizes], N
     "forecast": (forecast, lambda sizes: acts.of_forecast(frames(sizes), MotionFit().schedule.views_per_step)),
     "align": (align, lambda sizes: acts.of_alignment(frames(sizes), PoseOptions())),
     "matter in motion": (moving, lambda sizes: acts.of_motion(frames(sizes), FlowOptions())),
-    "pinn": (pinn, lambda sizes: acts.of_space_time(frames(sizes), Pinn())),
+    "pinn": (pinn, said_of_series),
     "each time": (each, said_of_method("gaussians")),
     "surface": (surface, lambda sizes: acts.of_surfaces(frames(sizes), SurfaceOptions())),
     "export .h5": (export(".h5"), said_of_export(".h5")),

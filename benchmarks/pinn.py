@@ -34,12 +34,12 @@ from rows import replaced, shown
 import holosplat as hs
 from holosplat.geometry import Grid
 from holosplat.mesh import TriangleMesh
-from holosplat.methods import Pinn, Task
+from holosplat.methods import Task
 from holosplat.methods.illumination import prepared
-from holosplat.methods.pinn import EachTime
 from holosplat.metrics import volume_scores
-from holosplat.representations import SpaceTimeField
 from holosplat.specimens.scene import MeshSeries
+from holosplat_bench.opponents.fields import SpaceTimeField
+from holosplat_bench.opponents.pinn import EachTime, Pinn
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "data" / "pinn.csv"
 SHAPE, PHOTONS, TIMES = (64, 48), 1000.0, 6

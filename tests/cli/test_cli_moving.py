@@ -19,11 +19,12 @@ from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import SmoothVolume
 from holosplat.motion.flow_reconstruction import FlowOptions
 from holosplat.optics.background import LightOptions
-from holosplat.representations import MovingGaussians, SpaceTimeField
+from holosplat.representations import MovingGaussians
 from holosplat.tables import read_rows
 from holosplat.workflows.reconstruct import load_reconstruction
 from holosplat.workflows.run_folder import RunFolder
 from holosplat.workflows.track import reconstruct_moving
+from holosplat_bench.opponents.fields import SpaceTimeField
 
 pytestmark = pytest.mark.usefixtures("unjudged_runs")
 

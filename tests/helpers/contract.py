@@ -12,9 +12,10 @@ import holosplat as hs
 from helpers.unjudged import unjudged
 from holosplat.baselines import HolographicTV
 from holosplat.fit.density import DensityControl
-from holosplat.methods import AlignedFit, Onix, PixelNerf, SmoothVolume
-from holosplat.representations import AlignedNetwork, Encoding, Network
+from holosplat.methods import SmoothVolume
 from holosplat.specimens.red_cells import icosphere
+from holosplat_bench.opponents.fields import AlignedNetwork, Encoding, Network
+from holosplat_bench.opponents.onix import AlignedFit, Onix, PixelNerf
 from holosplat_bench.opponents.photographs import AlphaRates, AlphaSplats, RadianceFields
 from holosplat_bench.suite.methods import METHODS, BenchMethod, methods
 from holosplat_bench.suite.methods import PHOTOGRAPHS as PHOTOGRAPHIC

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from holosplat.representations.perceptron import Jet
+from holosplat_bench.opponents.fields.perceptron import Jet
 
 Function = Callable[[Tensor], Tensor]
 """Of points [P, 4] `(x, y, z, t)`, each by itself: values [P, C], or [P]."""

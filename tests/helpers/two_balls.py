@@ -10,9 +10,10 @@ from holosplat.geometry import Grid, Views
 from holosplat.matter import Matter
 from holosplat.model import Instrument, Model
 from holosplat.optics.sampling import fringe_sampling
-from holosplat.representations import Encoding, Network, VoxelGrid
+from holosplat.representations import VoxelGrid
 from holosplat.scan import Exposures, Scan
 from holosplat.volume import LineIntegrals, Object
+from holosplat_bench.opponents.fields import Encoding, Network
 
 PIXEL, DELTA, BETA = 1e-6, 1e-6, 1e-9
 ONE = Matter.one(DELTA, BETA)

@@ -12,8 +12,8 @@ from torch.nn.functional import avg_pool3d, pad
 
 from holosplat.geometry import Grid, Poses, Views
 from holosplat.projectors.voxels.lattice import lattice_reference
-from holosplat.representations import NeuralField
 from holosplat.representations.voxels import along_axes, axis_matrices
+from holosplat_bench.opponents.fields import NeuralField
 
 DOUBLE = torch.float64
 ROWS = Grid((11, 7, 9), (1.1, 1.0, 0.9), (-4.0, -3.0, -3.7))

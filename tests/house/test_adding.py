@@ -80,7 +80,7 @@ def test_a_method_is_one_file_and_one_line(tmp_path, monkeypatch, scan):
     code, line = section("A method")
     module = loaded(monkeypatch, tmp_path, "methods", "thresholded", code)
     name, method = entry(line, module)
-    monkeypatch.setitem(METHODS, name, method)
+    monkeypatch.setitem(METHODS.own, name, method)
     plain = solve(PerView("tikhonov", "tv"), Task(scan.train(), KNOWN))
     found = solve(method, Task(scan.train(), KNOWN))
     assert set(found.values.unique().tolist()) == {0.0, 1.0}

@@ -25,6 +25,7 @@ from holosplat.optics.coherence import effective_geometry
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.red_cells import icosphere
 from holosplat.workflows.join import join
+from holosplat_bench.opponents.neural_fields import NeuralFields
 
 SOURCE, BEHIND, PIXEL = 0.25, 0.75, 4e-6
 WANTED = effective_geometry(SOURCE, BEHIND, PIXEL)
@@ -196,7 +197,7 @@ def test_what_needs_parallel_beams_refuses_cones(tmp_path: Path):
     scan = Scan(np.ones((3, *SHAPE)), Exposures.of(views, 20.0, 0.01), np.zeros(3))
     prior = hs.MaterialPrior.of_ratio(500.0)
     for call, what in (
-        (lambda: hs.reconstruct(scan, prior, hs.methods.NeuralFields()), "the method neural-field"),
+        (lambda: hs.reconstruct(scan, prior, NeuralFields()), "the method neural-field"),
         (lambda: hs.align_views(scan, prior), "finding poses"),
         (lambda: find_axis(scan), "finding the rotation axis"),
     ):

@@ -26,7 +26,7 @@ from holosplat.io.reading import Reading, ends_of, marked, read_angles
 from holosplat.io.stacks import all_images, stack_of
 from holosplat.io.table import Table
 from holosplat.io.vtk import read_meshes
-from holosplat.learning.start import read_aligned, read_weights
+from holosplat.learning.start import read_weights
 from holosplat.matter import MaterialPrior
 from holosplat.methods import Gaussians
 from holosplat.ranges import COUNT, with_checked_numbers
@@ -36,6 +36,7 @@ from holosplat.tables import overridden, read_table
 from holosplat.volume import Volume
 from holosplat.workflows.run_folder import RunFolder
 from holosplat.workflows.track import TRACKS, read_errors
+from holosplat_bench.opponents.fields.weights import read_aligned
 
 DIGITS = "1" + 399 * "0"
 LONGER = "1" + 4999 * "0"

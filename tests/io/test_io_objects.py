@@ -21,25 +21,27 @@ from holosplat.io.objects import FORMAT, read_gaussians, read_object, write_obje
 from holosplat.matter import Matter
 from holosplat.representations import (
     KINDS,
-    AlignedNetwork,
-    Encoding,
     Flow,
     GaussianCloud,
     Lattice,
     MovingGaussians,
     MovingSurfaces,
-    Network,
-    NeuralField,
-    PixelAligned,
-    PixelAlignedField,
-    SpaceTime,
-    SpaceTimeField,
     Stored,
     SurfaceMesh,
     TimeBasis,
     VoxelGrid,
 )
 from holosplat.specimens.red_cells import icosphere
+from holosplat_bench.opponents.fields import (
+    AlignedNetwork,
+    Encoding,
+    Network,
+    NeuralField,
+    PixelAligned,
+    PixelAlignedField,
+    SpaceTime,
+    SpaceTimeField,
+)
 from holosplat_bench.opponents.moving.deformed_voxels import Deformation, DeformedVoxels
 from holosplat_bench.opponents.moving.hexplane_field import HexPlaneField, HexPlanes
 from holosplat_bench.opponents.moving.moving_voxels import LowRankVoxels, VoxelSeries

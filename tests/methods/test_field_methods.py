@@ -15,11 +15,12 @@ from holosplat.fit.problem import Schedule
 from holosplat.fit.terms import Objective
 from holosplat.geometry import Grid
 from holosplat.matter import MaterialPrior, Matter
-from holosplat.methods import NeuralFit, VoxelFit, Voxels
+from holosplat.methods import VoxelFit, Voxels
 from holosplat.methods.method import Progress, Task, quiet, run_quietly
-from holosplat.methods.neural_field import NeuralStage, visual_hull, warmed_up
-from holosplat.representations import NeuralField, VoxelGrid
+from holosplat.representations import VoxelGrid
 from holosplat.scan import Scan
+from holosplat_bench.opponents.fields import NeuralField
+from holosplat_bench.opponents.neural_fields import NeuralFit, NeuralStage, visual_hull, warmed_up
 
 KNOWN, UNKNOWN = MaterialPrior.known(ONE.channels[0]), MaterialPrior.unknown()
 ROUGH = Objective(l1=0.0, spectral=1.0, floor=0.3)

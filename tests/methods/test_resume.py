@@ -21,13 +21,13 @@ from holosplat.fit.run import Record
 from holosplat.fit.terms import Objective
 from holosplat.geometry import Grid
 from holosplat.matter import MaterialPrior
-from holosplat.methods import NeuralFit, SurfaceFit, VoxelFit
+from holosplat.methods import SurfaceFit, VoxelFit
 from holosplat.methods.method import Task
-from holosplat.methods.neural_field import warmed_up, waves_fit
 from holosplat.methods.surface_fit import surface_fit
 from holosplat.methods.voxels import voxel_fit
-from holosplat.representations import NeuralField
 from holosplat.scan import Scan
+from holosplat_bench.opponents.fields import NeuralField
+from holosplat_bench.opponents.neural_fields import NeuralFit, warmed_up, waves_fit
 
 VALIDATED = {"validation_views": 1, "validate_every": 3}
 

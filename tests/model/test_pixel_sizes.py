@@ -19,12 +19,13 @@ from holosplat.matter import DeltaBeta, Matter
 from holosplat.mesh import TriangleMesh
 from holosplat.model import Alignment, Instrument, Model, measure
 from holosplat.model.alignment import rotation_matrices
-from holosplat.representations import Encoding, GaussianCloud, Network, NeuralField, VoxelGrid
+from holosplat.representations import GaussianCloud, VoxelGrid
 from holosplat.representations.gaussians import raw_of
 from holosplat.scan import Exposures
 from holosplat.specimens.red_cells import icosphere
 from holosplat.specimens.scene import MeshScene, VoxelScene
 from holosplat.volume import LineIntegrals, Object, Volume
+from holosplat_bench.opponents.fields import Encoding, Network, NeuralField
 
 PIXEL, SHAPE = 1e-6, (23, 29)
 CENTRE, RADIUS = np.array([1.0, -0.7, 0.5]) * PIXEL, 6 * PIXEL

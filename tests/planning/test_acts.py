@@ -16,13 +16,15 @@ import pytest
 from holosplat.align import PoseOptions
 from holosplat.geometry import Views
 from holosplat.learning.network import FINE, Size
-from holosplat.methods import METHODS, Pinn, SurfaceOptions
+from holosplat.methods import METHODS, SurfaceOptions
 from holosplat.motion.flow_reconstruction import FlowOptions
 from holosplat.motion.track_linking import TrackOptions
 from holosplat.planning import acts
 from holosplat.planning.needs import Needs, Sizes, of_fit, of_reconstruction
 from holosplat.planning.scan_facts import coarser
 from holosplat.scan import Exposures
+from holosplat.training.options import TrainOptions
+from holosplat.training.train import trainer_of
 from holosplat_bench.suite.methods import of_benchmark, of_methods
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -63,7 +65,7 @@ FRAMES: dict[str, Callable[[Exposures], Needs | None]] = {
     "track": lambda seen: acts.of_track(seen, TrackOptions()),
     "forecast": lambda seen: acts.of_forecast(seen, 16),
     "matter in motion": lambda seen: acts.of_motion(seen, FlowOptions()),
-    "pinn": lambda seen: acts.of_space_time(seen, Pinn()),
+    "pinn": lambda seen: of_fit(Sizes.of(seen), METHODS["pinn"]),
     "each time": lambda seen: acts.of_each_time(seen, METHODS["gaussians"], "levels"),
     "align": lambda seen: acts.of_alignment(seen, PoseOptions()),
     "surface": lambda seen: acts.of_surfaces(acts.one_time(seen), SurfaceOptions()),
@@ -122,11 +124,14 @@ def test_scenes_take_as_many_times_the_memory_as_there_are_processes():
 def test_a_wider_network_and_more_views_take_more():
     assert acts.LATTICE == FINE**3
     sizes = ((64, 81), 3)
-    plain = acts.of_training(*sizes, "start", Size(), 100)
-    wide = acts.of_training(*sizes, "start", Size(volume=(32, 80, 160)), 100)
-    more = acts.of_training((64, 81), 6, "start", Size(), 100)
+    plain = acts.of_training(*sizes, Size(), 100)
+    wide = acts.of_training(*sizes, Size(volume=(32, 80, 160)), 100)
+    more = acts.of_training((64, 81), 6, Size(), 100)
     assert wide.memory > plain.memory < more.memory
-    assert acts.of_training(*sizes, "onix", Size(), 100).memory != plain.memory
+    for network in ("onix", "pixelnerf"):
+        few, many = (trainer_of(network).needs((64, 81), views, TrainOptions(network=network)) for views in (3, 6))
+        assert few.memory < many.memory
+        assert few.memory != plain.memory
 
 
 def test_a_benchmark_takes_the_memory_of_its_largest_case_and_the_time_of_all():

@@ -15,10 +15,11 @@ from holosplat.backends import implementation
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
 from holosplat.matter import Matter
-from holosplat.representations import Encoding, Network, NeuralField, VoxelGrid, VoxelLines
-from holosplat.representations.neural_field import grown
+from holosplat.representations import VoxelGrid, VoxelLines
 from holosplat.representations.voxels import resampling
 from holosplat.volume import Object
+from holosplat_bench.opponents.fields import Encoding, Network, NeuralField
+from holosplat_bench.opponents.fields.neural_field import grown
 
 PIXEL = 2e-6
 SMALL = Network(Encoding(levels=2, features=2, coarsest=8.0, finest=3.0, log2_size=10), hidden=8, layers=1)

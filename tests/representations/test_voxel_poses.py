@@ -14,7 +14,8 @@ from helpers.poses import asking, gradients, relative
 from helpers.voxels import pronounced, twin
 from holosplat.geometry import Grid, Poses, Views
 from holosplat.matter import Matter
-from holosplat.representations import Encoding, Network, NeuralField, VoxelGrid, VoxelLines
+from holosplat.representations import VoxelGrid, VoxelLines
+from holosplat_bench.opponents.fields import Encoding, Network, NeuralField
 
 PIXEL = 2e-6
 

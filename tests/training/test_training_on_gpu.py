@@ -16,14 +16,15 @@ from helpers.ball_sample import ball_sample
 from helpers.pretended_gpu import OnGpu, pretended_gpu
 from holosplat.checks import InputError
 from holosplat.learning.network import Size
-from holosplat.learning.start import read_aligned, read_weights
-from holosplat.representations import AlignedNetwork
-from holosplat.training.aligned import AlignedTraining, AlignedValidation
+from holosplat.learning.start import read_weights
 from holosplat.training.folder import Dataset
 from holosplat.training.options import FrameLossWeights, Ranges, TrainOptions, ViewSampling
 from holosplat.training.sample import Sample
 from holosplat.training.shown import Validation
 from holosplat.training.train import Training
+from holosplat_bench.opponents.fields import AlignedNetwork
+from holosplat_bench.opponents.fields.weights import read_aligned
+from holosplat_bench.opponents.training import AlignedTraining, AlignedValidation
 
 pytest.importorskip("triton")
 

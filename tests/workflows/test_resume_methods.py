@@ -24,14 +24,10 @@ from holosplat.geometry import Views
 from holosplat.io.objects import read_object
 from holosplat.matter import MaterialPrior
 from holosplat.methods import (
-    AlignedFit,
     FitOptions,
     Gaussians,
     HolographicVoxels,
     Method,
-    NeuralFields,
-    NeuralFit,
-    Onix,
     PerView,
     SmoothVolume,
     SurfaceFit,
@@ -40,11 +36,13 @@ from holosplat.methods import (
     Voxels,
 )
 from holosplat.methods.coarse import CoarseToFine
-from holosplat.representations import AlignedNetwork, NeuralField
 from holosplat.scan import Exposures, Scan
 from holosplat.volume import Object
 from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
 from holosplat.workflows.run_folder import OBJECT_SUM, RunFolder
+from holosplat_bench.opponents.fields import AlignedNetwork, NeuralField
+from holosplat_bench.opponents.neural_fields import NeuralFields, NeuralFit
+from holosplat_bench.opponents.onix import AlignedFit, Onix
 
 VOLUME = HolographicTV(iterations=30, corrections=2, inner=8, refine=1)
 CLOUD = Gaussians(

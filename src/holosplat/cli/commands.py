@@ -119,9 +119,8 @@ def reconstruct(
         strict: Exit with 3 where the frames are not explained to within their noise; without it, that is a warning.
     """
     from ..io.formats import read_frames
-    from ..methods import Pinn
     from ..methods.uncertain import Uncertain
-    from ..planning.acts import of_space_time
+    from ..planning.needs import Sizes, of_fit
     from ..planning.scan_facts import can_be_seen
     from ..workflows.reconstruct import reconstruct as fit
     from ..workflows.run_folder import RunFolder, claimed
@@ -149,8 +148,8 @@ def reconstruct(
     prior = asked.matter.without_ranges().prior(measured.exposures.reference_energy, reading.told.wall)
     measured = measured.in_memory() if can_be_seen(measured) else measured
     seen = measured.exposures[~measured.is_test]
-    if isinstance(method, Pinn):
-        tell_frames(method.kind, seen, out, lambda frames: of_space_time(frames, method))
+    if method.of_series:
+        tell_frames(method.kind, seen, out, lambda frames: of_fit(Sizes.of(frames), method))
     elif not measured.is_series:
         tell_reconstruction(measured, out, method, prior, ways["matter"], ways["refine"] is not None)
     measured = measured.in_memory()

@@ -89,7 +89,7 @@ def train(
     """
     from ..report.curves import training_curves
     from ..training.dynamics import train_dynamics
-    from ..training.train import made_by
+    from ..training.train import made_by, trainer_of
 
     who = made_by(how.device)  # before files change under hours of work
     if how.network == "dynamics":
@@ -98,23 +98,19 @@ def train(
         print(f"errors across surfaces of series that were not trained on, in radii: {judged.last()}")
         print(f"wrote {weights} and {training_curves(out)}")
         return
-    from ..planning.acts import of_training
-    from ..training.aligned import AlignedTraining, AlignedValidation
     from ..training.folder import Dataset
     from ..training.shown import Validation
-    from ..training.train import Training
 
+    trainer = trainer_of(how.network)
     scenes = Dataset.read(data)
     scenes.require_whole()
     frames, views = (scenes.ranges.rows, scenes.ranges.columns), max(how.shown.views)
     views = min(views, scenes.ranges.views)
-    tell("the training", of_training(frames, views, how.network, how.size, how.steps), out)
-    kind = Training if how.network == "start" else AlignedTraining
-    training = (kind.resumed if resume else kind.begun)(scenes, out, how)
+    tell("the training", trainer.needs(frames, views, how), out)
+    training = (trainer.training.resumed if resume else trainer.training.begun)(scenes, out, how)
     with ProgressBar() as bar:
-        told = Validation.of(scenes.ranges, scenes.seed, how.validation, bar.of("scenes to validate"))
-        if how.network != "start":
-            told = AlignedValidation(told.samples, network=how.network)
+        drawn = Validation.of(scenes.ranges, scenes.seed, how.validation, bar.of("scenes to validate"))
+        told = trainer.validation(drawn.samples)
         with interruptible(lambda: _kept(out)):
             training.run(told, _show(bar, how))
     weights = training.finish(told, who)

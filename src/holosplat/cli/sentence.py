@@ -82,9 +82,10 @@ def tell(what: str, needs: Needs, out: Path, others: Iterable[tuple[str, Needs]]
     say(f"{what} {needs.line()}")
 
 
-def tell_frames(what: str, exposures: Exposures, out: Path, of: Callable[[Exposures], Needs]) -> None:
-    """The same of a job of which `of` says what it takes for such frames; larger pixels may fit."""
+def tell_frames(what: str, exposures: Exposures, out: Path, of: Callable[[Exposures], Needs | None]) -> None:
+    """The same of a job of which `of` says what it takes for such frames, where it is known; larger pixels may fit."""
     from ..planning.scan_facts import coarser
 
-    if len(exposures):  # without any there is nothing to do, as the job will say
-        tell(what, of(exposures), out, coarser(exposures, of))
+    # without any frames there is nothing to do, as the job will say
+    if len(exposures) and (needs := of(exposures)) is not None:
+        tell(what, needs, out, coarser(exposures, of))

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
+from ..plugins import Extended
 from .auto import Auto
 from .gaussian_options import FitOptions, GaussianRates
 from .gaussians import Gaussians, gaussian_fit
 from .ground import ExtraTerm
 from .method import Method, Near, Stage, Task, begun, finished
-from .neural_field import NeuralFields, NeuralFit
-from .onix import AlignedFit, Onix, PixelNerf
 from .per_view import PerView
-from .pinn import Pinn, PinnFit
 from .solve import Settled, settled, solve
 from .surface_fit import Extraction, SurfaceFit, SurfaceOptions
 from .surfaces import Surfaces, refine_surfaces
@@ -18,30 +16,27 @@ from .uncertain import Determined, Uncertain
 from .volume import SmoothVolume
 from .voxels import HolographicVoxels, VoxelFit, Voxels
 
-METHODS: dict[str, Method] = {
-    "auto": Auto(),
-    "gaussians": Gaussians(),
-    "surfaces": Surfaces(),
-    "voxels": Voxels(),
-    "volume": SmoothVolume(),
-    "neural-field": NeuralFields(),
-    "onix": Onix(),
-    "pixelnerf": PixelNerf(),
-    "holographic-tv": HolographicVoxels(),
-    "tikhonov-tv": PerView("tikhonov", "tv"),
-    "ctf-tv": PerView("ctf", "tv"),
-    "paganin-tv": PerView("paganin", "tv"),
-    "paganin-fbp": PerView("paganin", "fbp", bounded=False),
-    "paganin-sirt": PerView("paganin", "sirt", bounded=False),
-}
-"""Every method by the name that the command line knows, with its options by default."""
-OF_SERIES: dict[str, Method] = {"pinn": Pinn()}
-"""Those that take all times of a scan at once, and need several."""
+METHODS: Extended[Method] = Extended(
+    {
+        "auto": Auto(),
+        "gaussians": Gaussians(),
+        "surfaces": Surfaces(),
+        "voxels": Voxels(),
+        "volume": SmoothVolume(),
+        "holographic-tv": HolographicVoxels(),
+        "tikhonov-tv": PerView("tikhonov", "tv"),
+        "ctf-tv": PerView("ctf", "tv"),
+        "paganin-tv": PerView("paganin", "tv"),
+        "paganin-fbp": PerView("paganin", "fbp", bounded=False),
+        "paganin-sirt": PerView("paganin", "sirt", bounded=False),
+    },
+    "holosplat.methods",
+)
+"""Every method by the name that the command line knows, with its options by default; other packages add theirs
+(docs/adding.md)."""
 
 __all__ = [
     "METHODS",
-    "OF_SERIES",
-    "AlignedFit",
     "Auto",
     "Determined",
     "ExtraTerm",
@@ -52,13 +47,7 @@ __all__ = [
     "HolographicVoxels",
     "Method",
     "Near",
-    "NeuralFields",
-    "NeuralFit",
-    "Onix",
     "PerView",
-    "Pinn",
-    "PinnFit",
-    "PixelNerf",
     "Settled",
     "SmoothVolume",
     "Stage",

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from ..align import PoseOptions
     from ..learning.network import Size
     from ..matter import MatterKind
-    from ..methods import Method, Pinn
+    from ..methods import Method
     from ..methods.surface_fit import SurfaceOptions
     from ..motion.flow_reconstruction import FlowOptions
     from ..motion.track_linking import TrackOptions
@@ -48,20 +48,10 @@ class Parts:
     """A voxel of matter in motion: L-BFGS, gradients and priors."""
     sources: float = 14.0
     """The same voxel at each time: where the flow brought it from."""
-    space_time: float = 60.0
-    """A voxel of a field of space and time that a step looks at, with gradients."""
-    every_time: float = 12.0
-    """The same voxel at each time, of the volumes that the field begins with."""
     channel: float = 37.0
     """A channel of a voxel of the lattice of a network in training."""
     lifted: float = 49.0
     """A channel that is lifted from a view into such a voxel."""
-    aligned_trainer: float = 0.58e9
-    """The same of a pixel-aligned network."""
-    aligned: float = 120.0
-    """A voxel of a pixel-aligned field in training."""
-    aligned_view: float = 18.0
-    """The same in each view."""
     node_pairs: float = 10.0
     """A pair of nodes of two cells in flow, whose block is computed at once."""
     exported: float = 25.0
@@ -150,19 +140,6 @@ def of_motion(exposures: Exposures, how: FlowOptions) -> Needs:
     return Needs(memory, disk, 20 + 1.5e-4 * times * one.voxels)
 
 
-def of_space_time(exposures: Exposures, how: Pinn) -> Needs:
-    """What `reconstruct --method pinn` takes: volumes of all times, and those that a step looks at."""
-    one, times = Sizes.of(one_time(exposures)), times_of(exposures)
-    views = how.fit.schedule.views_per_step or len(exposures)
-    every, step = replace(one, views=len(exposures)), replace(one, views=min(views, len(exposures)))
-    looked = min(step.views, times)
-    fitted = (Parts.space_time * looked + Parts.every_time * times) * one.voxels + Costs.waves * step.waves()
-    disk = Costs.page + Costs.written * (KEPT * one.voxels * times / 4 + every.pixels)
-    seconds = 20 + 2e-7 * how.fit.schedule.steps * looked * one.voxels + 2e-4 * times * one.voxels
-    fitted = Costs.program + max(fitted, of_start(one, how.volume))
-    return Needs(Costs.frames * every.pixels + max(Parts.drawn, fitted), disk, seconds)
-
-
 def of_each_time(exposures: Exposures, method: Method, matter: MatterKind | None) -> Needs | None:
     """What each time by itself takes, one after the other; None for a method of which nothing is known."""
     one = of_fit(Sizes.of(one_time(exposures)), method, matter)
@@ -205,15 +182,11 @@ def of_dataset(simulated: Needs, shape: tuple[int, int], views: int, scenes: int
     return Needs(jobs * memory + (jobs > 1) * Costs.program, disk, 1.5e-4 * scenes * pixels / jobs)
 
 
-def of_training(shape: tuple[int, int], views: int, network: str, size: Size, steps: int) -> Needs:
-    """Estimate resources of `train` for scenes of so many pixels and shown views; size: of the network of `--start
-    learned`."""
-    rows, columns = shape
-    voxels = rows * columns**2
-    if network == "start":
-        voxels /= LATTICE
-        channels = sum(width / 8**level for level, width in enumerate(size.volume)) + 3 * size.features
-        memory = Parts.trainer + (Parts.channel * channels + Parts.lifted * size.features * views) * voxels
-    else:
-        memory = Parts.aligned_trainer + (Parts.aligned + Parts.aligned_view * views) * voxels
-    return Needs(memory, 1e8, steps * (0.2 + 2e-5 * views * voxels))
+def of_training(shape: tuple[int, int], views: int, size: Size, steps: int) -> Needs:
+    """Estimate resources of `train` of the network of `--start learned`, of a certain size, for scenes of so many
+    pixels and shown views."""
+    voxels = shape[0] * shape[1] ** 2
+    lattice = voxels / LATTICE
+    channels = sum(width / 8**level for level, width in enumerate(size.volume)) + 3 * size.features
+    memory = Parts.trainer + (Parts.channel * channels + Parts.lifted * size.features * views) * lattice
+    return Needs(memory, 1e8, steps * (0.2 + 2e-5 * views * lattice))

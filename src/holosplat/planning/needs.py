@@ -9,6 +9,9 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
 
 from ..baselines import HolographicTV
 from ..checks import InputError
@@ -19,10 +22,7 @@ from ..methods import (
     Gaussians,
     HolographicVoxels,
     Method,
-    NeuralFields,
-    Onix,
     PerView,
-    PixelNerf,
     SmoothVolume,
     Surfaces,
     Voxels,
@@ -57,14 +57,6 @@ class Costs:
     """A voxel of a smooth volume: six pairs of L-BFGS, gradients and priors."""
     plain: float = 52.0
     """A voxel of a tomography by itself."""
-    points: float = 0.11e9
-    """The points of a pixel-aligned field that are evaluated at once, and the weights."""
-    aligned: float = 90.0
-    """A voxel of such a field, of which two in five show matter: a fifth more is taken where all do."""
-    place: float = 5.0
-    """Such a voxel in a view: where its shadow lies."""
-    features: float = 1500.0
-    """A pixel of its images: what the encoder makes of it, with gradients."""
     waves: float = 150.0
     """A wave sample of all views in a fit, with its gradient."""
     edges: float = 105.0
@@ -113,20 +105,23 @@ FULL = 0.03
 
 @dataclass(frozen=True)
 class Sizes:
-    """views, rows and columns of frames; samples: of waves along a pixel; margin: rows and columns of it beside."""
+    """views, rows and columns of frames; samples: of waves along a pixel; margin: rows and columns of it beside; times:
+    of which the frames are."""
 
     views: int
     rows: int
     columns: int
     samples: int
     margin: tuple[int, int]
+    times: int = 1
 
     @classmethod
     def of(cls, exposures: Exposures, binning: int = 1) -> Sizes:
         """Those of exposures, on pixels `binning` times larger."""
         exposures = on_larger_pixels(exposures, binning)
         samples = fringe_sampling(exposures)
-        return cls(len(exposures), *exposures.views.shape, samples, padding(exposures, samples))
+        times = len(np.unique(exposures.time))
+        return cls(len(exposures), *exposures.views.shape, samples, padding(exposures, samples), times)
 
     @property
     def pixels(self) -> int:
@@ -178,6 +173,15 @@ class Needs:
     def fit(self, path: Path) -> bool:
         """Whether there is so much memory, and disk at `path`."""
         return SAFETY * self.memory <= free_memory() + Costs.program and self.disk <= free_disk(path)
+
+
+@runtime_checkable
+class Estimated(Protocol):
+    """A method that says itself what it takes, as those of other packages do."""
+
+    def needs(self, sizes: Sizes) -> Needs:
+        """Of training frames of such sizes, beside the program and the frames; `disk` in numbers of the object."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -293,6 +297,8 @@ def with_report(sizes: Sizes, memory: float) -> float:
 
 def _beside(sizes: Sizes, method: Method) -> Needs | None:
     """Resources beside the program and the frames; disk: in numbers of the object."""
+    if isinstance(method, Estimated):
+        return method.needs(sizes)
     if isinstance(method, PerView):
         memory = Costs.plain * sizes.voxels + Costs.rays * sizes.views * sizes.columns**2
         return Needs(memory, sizes.voxels, Costs.run + 0.35e-6 * sizes.views * sizes.voxels)
@@ -300,18 +306,11 @@ def _beside(sizes: Sizes, method: Method) -> Needs | None:
         small = sizes.joined(method.max_voxels)
         memory = max(Costs.smooth * small.voxels, of_start(small, method.volume))
         return Needs(memory, small.voxels, Costs.run + 4.5e-6 * sizes.views * small.voxels)
-    if isinstance(method, HolographicVoxels | Voxels | NeuralFields):
-        begun, fine = of_start(sizes, method.volume), _fine(sizes, method.volume)[0]
-        if isinstance(method, HolographicVoxels):
-            return Needs(begun, fine, Costs.run + 1.5e-6 * fine)
-        fitted = Costs.waves * sizes.waves() + Costs.plain * sizes.voxels
-        return Needs(max(begun, fitted), sizes.voxels, 20 + 3e-6 * fine)
-    if isinstance(method, Onix | PixelNerf):
-        small, steps = sizes.joined(method.fit.max_voxels), method.fit.schedule.steps
-        seen = small.views * small.voxels
-        memory = Costs.points + Costs.aligned * small.voxels + Costs.place * seen + Costs.features * small.pixels
-        memory += Costs.waves * sizes.waves()
-        return Needs(memory, small.voxels, 5 + 0.9e-6 * steps * seen)
+    if isinstance(method, HolographicVoxels):
+        fine = _fine(sizes, method.volume)[0]
+        return Needs(of_start(sizes, method.volume), fine, Costs.run + 1.5e-6 * fine)
+    if isinstance(method, Voxels):
+        return of_grid(sizes, method.volume)
     gaussians = method if isinstance(method, Gaussians) else getattr(method, "gaussians", None)
     return _bodies(sizes, gaussians, gaussians is not method) if isinstance(gaussians, Gaussians) else None
 
@@ -342,6 +341,12 @@ def _bodies(sizes: Sizes, how: Gaussians, edges: bool) -> Needs:
     filled = min(MOST_GAUSSIANS, FULL * sizes.voxels)
     memory = max(memory, Costs.waves * finer + Costs.filling * filled)
     return Needs(memory, 14 * filled, max(seconds, near + 2e-7 * filled * sizes.views))
+
+
+def of_grid(sizes: Sizes, how: HolographicTV) -> Needs:
+    """The same of voxels, or of a field that is looked at on voxels, fitted from such a start."""
+    fitted = Costs.waves * sizes.waves() + Costs.plain * sizes.voxels
+    return Needs(max(of_start(sizes, how), fitted), sizes.voxels, 20 + 3e-6 * _fine(sizes, how)[0])
 
 
 def _fine(sizes: Sizes, how: HolographicTV) -> tuple[int, int]:

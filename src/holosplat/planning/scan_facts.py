@@ -26,7 +26,7 @@ from ..io.raw_file import DARK, FLAT, INVALID, NAMES, PROJECTION, Loader, ScanFi
 from ..io.reading import Reading
 from ..io.stored_frames import StoredFrames, with_fields
 from ..matter import MatterKind
-from ..methods import Auto, HolographicVoxels, Method, NeuralFields, Surfaces, Voxels
+from ..methods import Auto, Method, SmoothVolume, Surfaces
 from ..methods.gaussians import Gaussians
 from ..methods.window import windows_of
 from ..optics.noise import NoiseModel, noise_levels, noise_share
@@ -294,7 +294,7 @@ def smaller(exposures: Exposures, method: Method, matter: MatterKind | None) -> 
     """The same reconstruction on larger voxels in the start, and on larger pixels; how, and what it takes then."""
     flag, coarse = "", method  # none where the method has no such start
     start = getattr(method, "volume", None)
-    if isinstance(start, HolographicTV) and isinstance(method, Gaussians | HolographicVoxels | Voxels | NeuralFields):
+    if isinstance(start, HolographicTV) and not isinstance(method, SmoothVolume):
         flag, coarse = "--set volume.refine=1", replace(method, volume=replace(start, refine=1))
     elif isinstance(method, Auto | Surfaces):
         gaussians = replace(method.gaussians, volume=replace(method.gaussians.volume, refine=1))
@@ -309,9 +309,10 @@ def smaller(exposures: Exposures, method: Method, matter: MatterKind | None) -> 
                 yield how, needs
 
 
-def coarser(exposures: Exposures, of: Callable[[Exposures], Needs]) -> Iterator[tuple[str, Needs]]:
+def coarser(exposures: Exposures, of: Callable[[Exposures], Needs | None]) -> Iterator[tuple[str, Needs]]:
     """What `of` says of the same frames on larger pixels; how, and what it takes then."""
     for factor in BINNINGS:
         if exposures.views.shape[1] // factor < FEWEST_COLUMNS:
             return
-        yield f"--bin {factor}", of(on_larger_pixels(exposures, factor))
+        if (needs := of(on_larger_pixels(exposures, factor))) is not None:
+            yield f"--bin {factor}", needs

@@ -140,8 +140,6 @@ NAMES = {
     "moving-gaussians": "Reconstruction as Gaussians that a flow carries",
     "space-time-field": "Reconstruction as a field of space and time",
     "voxels": "Voxel reconstruction",
-    "neural-field": "Reconstruction as a neural field",
-    "pixel-aligned-field": "Reconstruction as a pixel-aligned field",
 }
 """What a report is called, by the kind of object; others are called by what they say they are."""
 

@@ -11,16 +11,11 @@ from ..geometry import Grid, Poses, Views
 from ..matter import Matter
 from ..plugins import Extended
 from ..volume import LineIntegrals, TrainableObject
-from .aligned_network import AlignedNetwork, PixelAligned
 from .flow import Fading, Flow, Lattice, TimeBasis
 from .gaussians import GaussianCloud
 from .initialise import approximate, at_pitch, cloud_from_shares, cloud_from_volume, freed, random_cloud
 from .isosurface import isosurface
 from .moving_gaussians import MovingGaussians
-from .neural_field import Network, NeuralField
-from .perceptron import Encoding
-from .pixel_aligned import PixelAlignedField
-from .space_time import SpaceTime, SpaceTimeField
 from .surfaces import MovingSurfaces, SurfaceMesh
 from .voxels import VoxelGrid, VoxelLines
 
@@ -80,21 +75,13 @@ class InMotion(Stored, Protocol):
 
 
 KINDS: Extended[type[Stored]] = Extended(
-    {
-        kind.kind: kind
-        for kind in (
-            *(GaussianCloud, VoxelGrid, SurfaceMesh, MovingSurfaces, MovingGaussians, NeuralField),
-            *(SpaceTimeField, PixelAlignedField),
-        )
-    },
+    {kind.kind: kind for kind in (GaussianCloud, VoxelGrid, SurfaceMesh, MovingSurfaces, MovingGaussians)},
     "holosplat.kinds",
 )
 """Every kind of Object that files hold, by name; other packages add theirs (docs/adding.md)."""
 
 __all__ = [
     "KINDS",
-    "AlignedNetwork",
-    "Encoding",
     "Fading",
     "Flow",
     "GaussianCloud",
@@ -102,12 +89,6 @@ __all__ = [
     "Lattice",
     "MovingGaussians",
     "MovingSurfaces",
-    "Network",
-    "NeuralField",
-    "PixelAligned",
-    "PixelAlignedField",
-    "SpaceTime",
-    "SpaceTimeField",
     "Stored",
     "SurfaceMesh",
     "TimeBasis",

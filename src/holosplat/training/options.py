@@ -159,7 +159,7 @@ class TrainOptions:
     """How scenes are shown."""
     goal: LossWeights = field(default_factory=LossWeights)
     """The training loss."""
-    network: Literal["start", "onix", "pixelnerf", "dynamics"] = "start"
+    network: str = "start"
     """What is trained: the network of `--start learned`, or those of the methods `onix` and `pixelnerf`, which learn
     from frames alone, or that of `forecast --by graph`, on series of grow; these are of one size."""
     frames: FrameLossWeights = field(default_factory=FrameLossWeights)

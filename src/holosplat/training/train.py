@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -20,6 +20,9 @@ from ..checks import InputError, as_written, require
 from ..io.atomic import read_json, write_json, write_state
 from ..learning.network import Guess
 from ..learning.start import Card, write_weights
+from ..planning.acts import of_training
+from ..planning.needs import Needs
+from ..plugins import Extended
 from ..tables import to_table
 from ..version import source_commit
 from ..workflows.provenance import environment
@@ -177,6 +180,29 @@ class Training:
         asked, device = self.options.precision, self.options.device
         short = device == "cuda" or has_bfloat16() if asked == "auto" else asked == "bfloat16"
         return torch.autocast(device, torch.bfloat16) if short else nullcontext()
+
+
+class Trainer(NamedTuple):
+    """How a network learns from scenes. training: its steps; validation: scores of scenes that it does not see; needs:
+    memory, disk and time for frames of [rows, columns] in so many views."""
+
+    training: type[Training]
+    validation: Callable[[Sequence[Sample]], Validation]
+    needs: Callable[[tuple[int, int], int, TrainOptions], Needs]
+
+
+NETWORKS: Extended[Trainer] = Extended(
+    {"start": Trainer(Training, Validation, lambda shape, views, how: of_training(shape, views, how.size, how.steps))},
+    "holosplat.networks",
+)
+"""Networks that learn from scenes, by the name that --network knows; other packages add theirs (docs/adding.md)."""
+
+
+def trainer_of(network: str) -> Trainer:
+    """That of the network of this name. Errors: `InputError` for another name."""
+    known = ", ".join((*NETWORKS, "dynamics"))
+    require(network in NETWORKS, f"network must be one of {known}, but it is {network!r}.")
+    return NETWORKS[network]
 
 
 def _settings(data: Dataset, options: TrainOptions) -> dict[str, Any]:

@@ -23,7 +23,8 @@ from holosplat.model.scene import frames_of
 from holosplat.projectors.splat.reference import boxes, pairs, rotation_matrices
 from holosplat.representations.gaussians import PARAMETERS, GaussianCloud, raw_of
 from holosplat.representations.initialise import random_cloud
-from holosplat.representations.neural_field import CHUNK, Network, NeuralField, uniform
+
+from .fields.neural_field import CHUNK, Network, NeuralField, uniform
 
 DILATION = 0.3
 """Variance [pixels²] that is added to every projected Gaussian, its peak kept, so that none falls between pixels (as in

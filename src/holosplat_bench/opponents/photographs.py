@@ -31,10 +31,11 @@ from holosplat.methods.method import Method, Stage, Task
 from holosplat.model import Instrument, Model
 from holosplat.optics.retrieval import paganin
 from holosplat.ranges import Rate, Share, checked_dataclass
-from holosplat.representations import Encoding, Network, Stored
-from holosplat.representations.neural_field import uniform
+from holosplat.representations import Stored
 from holosplat.scan import Scan
 
+from .fields import Encoding, Network
+from .fields.neural_field import uniform
 from .photographed import AlphaCloud, RadianceField
 
 

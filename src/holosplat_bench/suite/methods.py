@@ -25,10 +25,7 @@ from holosplat.methods import (
     Gaussians,
     HolographicVoxels,
     Method,
-    NeuralFields,
-    Onix,
     PerView,
-    PixelNerf,
     SmoothVolume,
     Surfaces,
     Voxels,
@@ -46,6 +43,8 @@ from holosplat.volume import Object, Volume
 from holosplat.workflows.reconstruct import reconstruct
 
 from ..opponents.mbir import MbirPerView
+from ..opponents.neural_fields import NeuralFields
+from ..opponents.onix import Onix, PixelNerf
 from ..opponents.photographs import AlphaSplats, RadianceFields
 from .folder import REFERENCE
 from .prepare import MeasuredCase

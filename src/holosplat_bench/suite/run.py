@@ -25,8 +25,6 @@ from holosplat.optics.sampling import fringe_sampling
 from holosplat.progress import Progress
 from holosplat.representations import (
     MovingSurfaces,
-    NeuralField,
-    PixelAlignedField,
     Stored,
     SurfaceMesh,
     VoxelGrid,
@@ -39,6 +37,7 @@ from holosplat.volume import Object, Volume
 from holosplat.workflows.evaluate import Scores, score_object
 from holosplat.workflows.provenance import environment, scan_hash
 
+from ..opponents.fields import NeuralField, PixelAlignedField
 from .arena.contest import status_bytes
 from .folder import BenchFolder, Row, good_name
 from .methods import Aligner, BenchMethod, Reference

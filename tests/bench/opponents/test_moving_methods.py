@@ -17,7 +17,7 @@ from holosplat.fit.problem import Schedule
 from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.mesh import TriangleMesh
-from holosplat.methods import HolographicVoxels, Method, Pinn, Task, VoxelFit, Voxels, solve
+from holosplat.methods import HolographicVoxels, Method, Task, VoxelFit, Voxels, solve
 from holosplat.methods.ground import ground
 from holosplat.representations import VoxelGrid
 from holosplat.scan import Exposures, Scan
@@ -40,6 +40,7 @@ from holosplat_bench.opponents.moving.deformed_voxels import Deformation
 from holosplat_bench.opponents.moving.hexplane_field import HexPlanes
 from holosplat_bench.opponents.moving.moving_voxels import OnVoxels
 from holosplat_bench.opponents.moving.times import DrawnTimes, spectral_objective, weight_of
+from holosplat_bench.opponents.pinn import Pinn
 
 PIXEL, SHAPE = 1e-6, (21, 17)
 MATTER = DeltaBeta(8e-7, 8e-10)

@@ -14,8 +14,9 @@ from holosplat.geometry import Grid, Poses, Views
 from holosplat.io.objects import read_object, write_object
 from holosplat.matter import Matter
 from holosplat.model import Instrument, Model
-from holosplat.representations import Encoding, Network, random_cloud
+from holosplat.representations import random_cloud
 from holosplat.scan import Exposures
+from holosplat_bench.opponents.fields import Encoding, Network
 from holosplat_bench.opponents.photographed import AlphaCloud, RadianceField
 
 PIXEL, SHAPE = 2e-6, (7, 11)

@@ -12,7 +12,7 @@ from typing import Any
 
 from ...checks import InputError, require
 from ...tables import changed, merged, overridden, read_table
-from .. import METHODS, OF_SERIES
+from .. import METHODS
 from ..gaussians import Gaussians
 from ..method import Method
 
@@ -56,10 +56,9 @@ def preset(name: str) -> Gaussians:
 
 def method_called(name: str) -> Method:
     """The method called `name` with its options by default; `InputError` listing the names otherwise."""
-    every = METHODS | OF_SERIES
-    if name not in every:
-        raise InputError(f"method must be one of {', '.join(every)}, but it is {name!r}.")
-    return every[name]
+    if name not in METHODS:
+        raise InputError(f"method must be one of {', '.join(METHODS)}, but it is {name!r}.")
+    return METHODS[name]
 
 
 def chosen_method(
@@ -99,7 +98,7 @@ def method_of(table: dict[str, Any], where: str = "options") -> Method:
     """
     values = dict(_modern(table))
     base, kind = values.pop("base", None), values.get("kind")
-    kinds = {type(method).kind: type(method) for method in (METHODS | OF_SERIES).values()}
+    kinds = {type(method).kind: type(method) for method in METHODS.values()}
     known = kind is None or kind in list(kinds)
     require(known, f"{where}.kind must be one of {', '.join(kinds)}, but it is {kind!r}.")
     if base is None:
@@ -112,10 +111,9 @@ def method_of(table: dict[str, Any], where: str = "options") -> Method:
 
 
 def _based_on(name: str) -> Method:
-    every = METHODS | OF_SERIES
-    known = dict.fromkeys((*preset_names(), *every))
+    known = dict.fromkeys((*preset_names(), *METHODS))
     require(name in known, f"base must be one of {', '.join(known)}, but it is {name!r}.")
-    return every[name] if name in every else preset(name)
+    return METHODS[name] if name in METHODS else preset(name)
 
 
 def _modern(options: dict[str, Any]) -> dict[str, Any]:

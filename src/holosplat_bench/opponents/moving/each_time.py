@@ -21,13 +21,13 @@ from holosplat.methods.cross_validation import assumed_material
 from holosplat.methods.ground import ground
 from holosplat.methods.illumination import prepared
 from holosplat.methods.method import Method, Stage, Task, finished, quiet, solve_stages
-from holosplat.methods.pinn import FEWEST_TIMES
 from holosplat.methods.solve import settled
 from holosplat.progress import Progress
 from holosplat.ranges import Weight, checked_dataclass
 from holosplat.representations import Stored
 from holosplat.scan import Scan
 
+from ..pinn import FEWEST_TIMES
 from .moving_voxels import VoxelSeries
 from .times import AllTimes, SpaceTimeVariation4D, frames_of_a_time, spectral_objective, weight_of
 

@@ -13,10 +13,10 @@ from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
 from holosplat.matter import Matter
 from holosplat.model import Instrument, Model
-from holosplat.representations import AlignedNetwork, PixelAligned, PixelAlignedField
-from holosplat.representations.aligned_network import InParts
-from holosplat.representations.pixel_aligned import places_of
 from holosplat.scan import Exposures
+from holosplat_bench.opponents.fields import AlignedNetwork, PixelAligned, PixelAlignedField
+from holosplat_bench.opponents.fields.aligned_network import InParts
+from holosplat_bench.opponents.fields.pixel_aligned import places_of
 
 PIXEL = 1e-6
 ONE = Matter.one(1e-6, 1e-9)
@@ -76,7 +76,7 @@ def test_the_order_of_the_views_does_not_matter_and_their_number_may_be_any(view
 @pytest.mark.parametrize("octaves", [0, 2])
 def test_what_is_told_without_gradients_is_the_same_but_for_rounding(octaves, monkeypatch):
     """In float64 to the last digits, on points in and beyond the image, in more than one piece."""
-    monkeypatch.setattr("holosplat.representations.aligned_network.CHUNK", 64)
+    monkeypatch.setattr("holosplat_bench.opponents.fields.aligned_network.CHUNK", 64)
     generator = torch.Generator().manual_seed(5)
     network = PixelAligned(AlignedNetwork((3, 4), 5, octaves), 1).double()
     features = torch.randn(3, 5, 9, 13, generator=generator, dtype=torch.float64)
@@ -88,7 +88,7 @@ def test_what_is_told_without_gradients_is_the_same_but_for_rounding(octaves, mo
 
 def test_gradients_in_parts_are_those_of_all_points_at_once(monkeypatch):
     """Of features and weights, in float64, in four pieces of which the last is smaller."""
-    monkeypatch.setattr("holosplat.representations.aligned_network.CHUNK", 64)
+    monkeypatch.setattr("holosplat_bench.opponents.fields.aligned_network.CHUNK", 64)
     generator = torch.Generator().manual_seed(7)
     network = PixelAligned(AlignedNetwork((3, 4), 5, 2), 1).double()
     features = torch.randn(3, 5, 9, 13, generator=generator, dtype=torch.float64, requires_grad=True)

@@ -12,9 +12,9 @@ from helpers.jets import curl, jet_of
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
 from holosplat.matter import Matter
-from holosplat.representations import SpaceTime, SpaceTimeField
-from holosplat.representations.perceptron import VelocityNetwork
-from holosplat.representations.space_time import Frame
+from holosplat_bench.opponents.fields import SpaceTime, SpaceTimeField
+from holosplat_bench.opponents.fields.perceptron import VelocityNetwork
+from holosplat_bench.opponents.fields.space_time import Frame
 
 PITCH = 2e-6
 GRID = Grid((9, 7, 13), (PITCH, PITCH, PITCH), (-11e-6, -7e-6, -8e-6))

@@ -17,8 +17,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import embedding_bag, grid_sample
 
-from ..checks import at_least, require
-from ..ranges import Weight, checked_dataclass
+from holosplat.checks import at_least, require
+from holosplat.ranges import Weight, checked_dataclass
 
 OUTPUTS = 4
 """Three of the velocity, or of its potential, and the pressure."""

@@ -9,20 +9,24 @@ from typing import ClassVar
 
 import torch
 
-from ..baselines import HolographicTV, holographic_tv
-from ..checks import at_least, require
-from ..fit.loop import Fit, Plan
-from ..fit.optimiser import Adam
-from ..fit.problem import Problem, Schedule, Term
-from ..fit.terms import Objective
-from ..fit.terms.field import Equations, EquationTerm, SpaceTimeVariation
-from ..matter import Matter
-from ..ranges import Rate, Weight, checked_dataclass
-from ..representations import SpaceTime, SpaceTimeField, Stored
-from ..representations.space_time import FLOW
-from .cross_validation import assumed_material
-from .ground import ExtraTerm, Ground, ground
-from .method import Method, Stage, Task, one_material
+from holosplat.baselines import HolographicTV, holographic_tv
+from holosplat.checks import at_least, require
+from holosplat.fit.loop import Fit, Plan
+from holosplat.fit.optimiser import Adam
+from holosplat.fit.problem import Problem, Schedule, Term
+from holosplat.fit.terms import Objective
+from holosplat.matter import Matter
+from holosplat.methods.cross_validation import assumed_material
+from holosplat.methods.ground import ExtraTerm, Ground, ground
+from holosplat.methods.method import Method, Stage, Task, one_material
+from holosplat.planning.acts import Parts
+from holosplat.planning.needs import Costs, Needs, Sizes, of_start
+from holosplat.ranges import Rate, Weight, checked_dataclass
+from holosplat.representations import Stored
+
+from .fields import SpaceTime, SpaceTimeField
+from .fields.space_time import FLOW
+from .fields.terms import Equations, EquationTerm, SpaceTimeVariation
 
 EACH, FLOW_ALONE, THROUGH_WAVES = "each time by itself", "flow of these", "field through the waves"
 FEWEST_TIMES = 2
@@ -31,6 +35,10 @@ OCCUPANCY = "object.coefficients"
 """The parameter of the matter; all others are the velocity's."""
 SECOND_STAGE = 1_000_003
 """Added to the seed for the stage through the waves."""
+LOOKED_AT = 60.0
+"""Bytes of memory of a voxel that a step looks at, with gradients (`benchmarks/needs_acts.py`)."""
+EVERY_TIME = 12.0
+"""The same of each time, of the volumes that the field begins with."""
 
 
 @checked_dataclass
@@ -84,6 +92,20 @@ class Pinn(Method):
         if self.fit.equations.continuity == 0:
             return (begin, Waves(self.fit))
         return (begin, FlowAlone(self.fit), Waves(self.fit))
+
+    def needs(self, sizes: Sizes) -> Needs:
+        """Volumes of all times, and those that a step looks at (`planning.needs.Estimated`)."""
+        one, times, drawn = replace(sizes, views=max(1, sizes.views // sizes.times)), sizes.times, self.fit.schedule
+        step = replace(one, views=min(drawn.views_per_step or sizes.views, sizes.views))
+        looked = min(step.views, times)
+        fitted = (LOOKED_AT * looked + EVERY_TIME * times) * one.voxels + Costs.waves * step.waves()
+        memory = max(Parts.drawn - Costs.program, fitted, of_start(one, self.volume))
+        seconds = 20 + 2e-7 * drawn.steps * looked * one.voxels + 2e-4 * times * one.voxels
+        return Needs(memory, one.voxels * times / 4, seconds)
+
+
+PINN = Pinn()
+"""As `METHODS` has it."""
 
 
 @dataclass(frozen=True)

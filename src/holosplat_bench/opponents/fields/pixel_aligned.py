@@ -12,15 +12,16 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from ..backends import in_main_memory
-from ..checks import positive, require, require_shapes
-from ..display import of_object
-from ..geometry import Grid, Poses, Views
-from ..matter import Matter
-from ..tables import from_table, to_table
-from ..volume import LineIntegrals, Volume
+from holosplat.backends import in_main_memory
+from holosplat.checks import positive, require, require_shapes
+from holosplat.display import of_object
+from holosplat.geometry import Grid, Poses, Views
+from holosplat.matter import Matter
+from holosplat.representations.voxels import VoxelGrid
+from holosplat.tables import from_table, to_table
+from holosplat.volume import LineIntegrals, Volume
+
 from .aligned_network import INPUTS, AlignedNetwork, InParts, PixelAligned, called
-from .voxels import VoxelGrid
 
 DEFAULT = AlignedNetwork()
 

@@ -17,8 +17,8 @@ from torch import Tensor, nn
 from torch.func import functional_call
 from torch.nn.functional import embedding_bag, grid_sample, interpolate, leaky_relu
 
-from ..checks import at_least, require
-from ..ranges import Natural, checked_dataclass
+from holosplat.checks import at_least, require
+from holosplat.ranges import Natural, checked_dataclass
 
 MOST_LEVELS = 10
 """Levels of the encoder, at most: the coarsest of eleven is of one pixel where the finest has a thousand."""

@@ -12,19 +12,19 @@ import holosplat as hs
 from helpers.unjudged import unjudged
 from holosplat.baselines import HolographicTV
 from holosplat.checks import InputError
-from holosplat.fit.terms.field import Equations
 from holosplat.geometry import Views
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.mesh import TriangleMesh
-from holosplat.methods import Pinn, PinnFit, Task, solve
-from holosplat.methods.pinn import FLOW_ALONE, THROUGH_WAVES
+from holosplat.methods import Task, solve
 from holosplat.methods.presets import method_called
-from holosplat.representations import SpaceTime, SpaceTimeField
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.red_cells import icosphere
 from holosplat.specimens.scene import MeshScene, MeshSeries
 from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
 from holosplat.workflows.run_folder import RunFolder
+from holosplat_bench.opponents.fields import SpaceTime, SpaceTimeField
+from holosplat_bench.opponents.fields.terms import Equations
+from holosplat_bench.opponents.pinn import FLOW_ALONE, THROUGH_WAVES, Pinn, PinnFit
 
 PIXEL, SHAPE = 1e-6, (17, 23)
 MATTER = DeltaBeta(8e-7, 8e-10)

@@ -12,17 +12,18 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from ..backends import in_main_memory
-from ..checks import positive, require, require_shapes
-from ..display import of_object
-from ..geometry import Grid, Poses, Views
-from ..matter import Matter
-from ..ranges import Pixels, checked_dataclass
-from ..tables import from_table, to_table
-from ..volume import LineIntegrals, Volume
-from .flow import Lattice, TimeBasis
+from holosplat.backends import in_main_memory
+from holosplat.checks import positive, require, require_shapes
+from holosplat.display import of_object
+from holosplat.geometry import Grid, Poses, Views
+from holosplat.matter import Matter
+from holosplat.ranges import Pixels, checked_dataclass
+from holosplat.representations.flow import Lattice, TimeBasis
+from holosplat.representations.voxels import VoxelGrid, along_axes
+from holosplat.tables import from_table, to_table
+from holosplat.volume import LineIntegrals, Volume
+
 from .perceptron import Jet, VelocityNetwork
-from .voxels import VoxelGrid, along_axes
 
 FLOW = "flow."
 """Before the names of the velocity's weights."""

@@ -11,26 +11,29 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from ..backends import Backend, device, resolve
-from ..baselines import HolographicTV
-from ..checks import at_least, require
-from ..fit.loop import Fit, Plan
-from ..fit.optimiser import Adam, Group, Leaves, Trainable
-from ..fit.problem import Problem, Schedule
-from ..fit.run import Record
-from ..fit.terms import Objective
-from ..fit.terms.field import FieldVariation, RetrievedThickness
-from ..geometry import Grid, Poses, Views
-from ..matter import Matter
-from ..model import Model
-from ..optics.background import Light
-from ..ranges import Rate, Weight, checked_dataclass
-from ..representations import NeuralField, Stored, VoxelGrid
-from ..representations.neural_field import Network, grown
-from ..scan import Scan
-from .ground import ExtraTerm, ground
-from .method import Method, Stage, Task, run_quietly
-from .voxels import HolographicStage
+from holosplat.backends import Backend, device, resolve
+from holosplat.baselines import HolographicTV
+from holosplat.checks import at_least, require
+from holosplat.fit.loop import Fit, Plan
+from holosplat.fit.optimiser import Adam, Group, Leaves, Trainable
+from holosplat.fit.problem import Problem, Schedule
+from holosplat.fit.run import Record
+from holosplat.fit.terms import Objective
+from holosplat.geometry import Grid, Poses, Views
+from holosplat.matter import Matter
+from holosplat.methods.ground import ExtraTerm, ground
+from holosplat.methods.method import Method, Stage, Task, run_quietly
+from holosplat.methods.voxels import HolographicStage
+from holosplat.model import Model
+from holosplat.optics.background import Light
+from holosplat.planning.needs import Needs, Sizes, of_grid
+from holosplat.ranges import Rate, Weight, checked_dataclass
+from holosplat.representations import Stored, VoxelGrid
+from holosplat.scan import Scan
+
+from .fields import NeuralField
+from .fields.neural_field import Network, grown
+from .fields.terms import FieldVariation, RetrievedThickness
 
 WARM_UP, THROUGH_WAVES = "field for the retrieved thickness", "field through the waves"
 BETAS, EPSILON = (0.9, 0.99), 1e-15
@@ -104,6 +107,14 @@ class NeuralFields(Method):
         """The same method with `effort` times the steps, at least one."""
         first, schedule = max(1, round(effort * self.fit.warmup_steps)), self.fit.schedule.with_effort(effort)
         return replace(self, fit=replace(self.fit, warmup_steps=first, schedule=schedule))
+
+    def needs(self, sizes: Sizes) -> Needs:
+        """As of voxels (`planning.needs.Estimated`)."""
+        return of_grid(sizes, self.volume)
+
+
+NEURAL_FIELD = NeuralFields()
+"""As `METHODS` has it."""
 
 
 @dataclass(frozen=True)

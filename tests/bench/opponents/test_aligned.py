@@ -13,14 +13,22 @@ from helpers.ball_sample import ball_sample
 from helpers.two_balls import ONE, scan, truth
 from holosplat.checks import InputError
 from holosplat.fit.problem import Schedule
-from holosplat.learning.start import Card, read_aligned, write_aligned, write_weights
+from holosplat.learning.start import Card, write_weights
 from holosplat.matter import MaterialPrior
-from holosplat.methods import AlignedFit, Onix, PixelNerf, Task, solve
-from holosplat.representations import AlignedNetwork, PixelAligned, PixelAlignedField
-from holosplat.training.aligned import AlignedTraining, AlignedValidation, Critic, draw_aligned_example, first_views
+from holosplat.methods import Task, solve
 from holosplat.training.folder import Dataset
 from holosplat.training.options import FrameLossWeights, Ranges, TrainOptions, ViewSampling
 from holosplat.training.sample import Sample
+from holosplat_bench.opponents.fields import AlignedNetwork, PixelAligned, PixelAlignedField
+from holosplat_bench.opponents.fields.weights import read_aligned, write_aligned
+from holosplat_bench.opponents.onix import AlignedFit, Onix, PixelNerf
+from holosplat_bench.opponents.training import (
+    AlignedTraining,
+    AlignedValidation,
+    Critic,
+    draw_aligned_example,
+    first_views,
+)
 
 SMALL = AlignedNetwork((4, 6), 8, 2)
 OPTIONS = TrainOptions(

@@ -10,13 +10,20 @@ import torch
 
 from helpers.jets import jet_of
 from holosplat.fit.problem import Batch
-from holosplat.fit.terms.field import Equations, EquationTerm, SpaceTimeVariation, continuity, divergence, momentum
 from holosplat.geometry import Grid, Views
 from holosplat.matter import Matter
 from holosplat.model import Instrument, Model
-from holosplat.representations import SpaceTime, SpaceTimeField
-from holosplat.representations.perceptron import Jet, VelocityNetwork
 from holosplat.scan import Exposures
+from holosplat_bench.opponents.fields import SpaceTime, SpaceTimeField
+from holosplat_bench.opponents.fields.perceptron import Jet, VelocityNetwork
+from holosplat_bench.opponents.fields.terms import (
+    Equations,
+    EquationTerm,
+    SpaceTimeVariation,
+    continuity,
+    divergence,
+    momentum,
+)
 
 PITCH, ONE = 1e-6, Matter.one(3e-7, 2e-10)
 RE = 3.0

@@ -4,32 +4,36 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import leaky_relu, softplus
 
-from ..checks import InputError
-from ..geometry import Grid, Views, rotation_y
-from ..learning.start import ONIX, Card, images, write_aligned
-from ..matter import Matter
-from ..methods.neural_field import visual_hull
-from ..methods.onix import AlignedFit
-from ..model import Instrument, Model
-from ..optics.sampling import fringe_sampling
-from ..representations import AlignedNetwork, PixelAligned, PixelAlignedField, VoxelGrid
-from ..representations.neural_field import grown
-from ..scan import Exposures
-from .folder import Dataset
-from .options import TrainOptions, ViewSampling
-from .sample import Sample, SampleScan, as_scan
-from .shown import Validation, share_of_overlap
-from .train import BETAS, PURPOSE, Training
+from holosplat.checks import InputError
+from holosplat.geometry import Grid, Views, rotation_y
+from holosplat.learning.start import Card, images
+from holosplat.matter import Matter
+from holosplat.model import Instrument, Model
+from holosplat.optics.sampling import fringe_sampling
+from holosplat.planning.needs import Needs
+from holosplat.representations import VoxelGrid
+from holosplat.scan import Exposures
+from holosplat.training.folder import Dataset
+from holosplat.training.options import TrainOptions, ViewSampling
+from holosplat.training.sample import Sample, SampleScan, as_scan
+from holosplat.training.shown import Validation, share_of_overlap
+from holosplat.training.train import BETAS, PURPOSE, Trainer, Training
+
+from .fields import AlignedNetwork, PixelAligned, PixelAlignedField
+from .fields.neural_field import grown
+from .fields.weights import ONIX, PIXELNERF, write_aligned
+from .neural_fields import visual_hull
+from .onix import AlignedFit
 
 FIT = AlignedFit()
 """The field lives where that of a reconstruction does."""
@@ -223,7 +227,7 @@ class AlignedValidation(Validation):
 
     columns: ClassVar[tuple[str, ...]] = ("step", "views", "misfit", "dice")
 
-    network: Literal["onix", "pixelnerf"] = "onix"
+    network: str = ONIX
     size: AlignedNetwork = DEFAULT
 
     def _scores(self, network: nn.Module, sample: Sample, count: int) -> tuple[float, float, float]:
@@ -233,3 +237,22 @@ class AlignedValidation(Validation):
             voxels = lesson.field(dict(network.named_parameters()), self.size).at(0.0)
             misfit = float(lesson.misfit(voxels))
         return misfit, share_of_overlap(voxels.values[0].cpu() > 0.5, torch.from_numpy(sample.occupancy) > 127), misfit
+
+
+PROGRAM, VOXEL, VOXEL_IN_VIEW = 0.58e9, 120.0, 18.0
+"""Bytes of memory of a training: the program with its optimiser, a voxel of the field, and a voxel in each view
+(`benchmarks/needs_acts.py`)."""
+
+
+def needs_of_training(shape: tuple[int, int], views: int, options: TrainOptions) -> Needs:
+    """What a training takes for scenes of so many pixels and shown views."""
+    voxels = shape[0] * shape[1] ** 2
+    memory = PROGRAM + (VOXEL + VOXEL_IN_VIEW * views) * voxels
+    return Needs(memory, 1e8, options.steps * (0.2 + 2e-5 * views * voxels))
+
+
+ONIX_TRAINER, PIXELNERF_TRAINER = (
+    Trainer(AlignedTraining, partial(AlignedValidation, network=network), needs_of_training)
+    for network in (ONIX, PIXELNERF)
+)
+"""As `training.train.NETWORKS` has them."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from helpers.ball_sample import ball_sample
 from helpers.cli import holosplat, refused, worked
-from holosplat.learning.start import read_aligned
-from holosplat.representations import AlignedNetwork
 from holosplat.training.folder import Dataset
 from holosplat.training.options import Ranges
+from holosplat_bench.opponents.fields import AlignedNetwork
+from holosplat_bench.opponents.fields.weights import read_aligned
 
 
 def test_a_network_is_trained_and_the_method_of_its_name_takes_it(tmp_path, monkeypatch, shop, unjudged_runs):

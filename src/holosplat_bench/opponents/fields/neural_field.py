@@ -15,16 +15,17 @@ from torch import Tensor, nn
 from torch.func import functional_call
 from torch.nn.functional import max_pool3d, softplus
 
-from ..backends import device
-from ..checks import at_least, require, require_shapes
-from ..display import of_object
-from ..geometry import Grid, Poses, Views
-from ..matter import Matter
-from ..ranges import checked_dataclass
-from ..tables import from_table, to_table
-from ..volume import LineIntegrals, Unmoved, Volume
+from holosplat.backends import device
+from holosplat.checks import at_least, require, require_shapes
+from holosplat.display import of_object
+from holosplat.geometry import Grid, Poses, Views
+from holosplat.matter import Matter
+from holosplat.ranges import checked_dataclass
+from holosplat.representations.voxels import resampling
+from holosplat.tables import from_table, to_table
+from holosplat.volume import LineIntegrals, Unmoved, Volume
+
 from .perceptron import Encoding
-from .voxels import resampling
 
 CHUNK = 1 << 18
 """Positions evaluated at once where no gradient is needed."""

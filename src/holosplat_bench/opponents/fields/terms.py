@@ -19,17 +19,19 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from ...checks import at_least
-from ...geometry import Views
-from ...model import Model
-from ...ranges import Small, Weight, checked_dataclass
-from ...representations import NeuralField, PixelAlignedField, SpaceTimeField, VoxelGrid
-from ...representations.neural_field import Samples, uniform
-from ...representations.perceptron import Jet
-from ...representations.space_time import Frame
-from ..problem import FIXED, Batch, LossPart
-from ..total_variation import total_variation
-from .frames import FrameTerm
+from holosplat.checks import at_least
+from holosplat.fit.problem import FIXED, Batch, LossPart
+from holosplat.fit.terms import FrameTerm
+from holosplat.fit.total_variation import total_variation
+from holosplat.geometry import Views
+from holosplat.model import Model
+from holosplat.ranges import Small, Weight, checked_dataclass
+from holosplat.representations import VoxelGrid
+
+from .neural_field import NeuralField, Samples, uniform
+from .perceptron import Jet
+from .pixel_aligned import PixelAlignedField
+from .space_time import Frame, SpaceTimeField
 
 APART = 0.5
 """Distance [voxel edges] of the two points between which a field's variation is measured."""

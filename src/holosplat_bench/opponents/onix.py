@@ -2,7 +2,7 @@
 
 A network that has seen many scenes by their frames alone (`holosplat train --network onix`), or none, says what is at
 a point by what all views show in front of it; then its weights are fitted to the frames of this scan. The field itself
-is `representations.PixelAlignedField`.
+is `fields.PixelAlignedField`.
 """
 
 from __future__ import annotations
@@ -15,24 +15,41 @@ from typing import ClassVar, Self
 import torch
 from torch import Tensor
 
-from ..checks import require
-from ..fit.loop import Fit, Plan
-from ..fit.optimiser import Adam
-from ..fit.problem import Problem, Schedule, Term
-from ..fit.terms import Objective
-from ..fit.terms.field import AlignedFrames, AlignedLines
-from ..geometry import Grid
-from ..learning.start import ONIX, PIXELNERF, images, read_aligned, seen_in
-from ..matter import DeltaBeta, Matter
-from ..ranges import Natural, Rate, Share, Weight, checked_dataclass
-from ..representations import AlignedNetwork, PixelAligned, PixelAlignedField, Stored
-from ..representations.neural_field import grown
-from ..scan import Scan
-from .cross_validation import assumed_material
-from .ground import ExtraTerm, ground
-from .method import Method, Stage, Task, one_material
-from .neural_field import visual_hull
-from .volume import binning
+from holosplat.checks import require
+from holosplat.fit.loop import Fit, Plan
+from holosplat.fit.optimiser import Adam
+from holosplat.fit.problem import Problem, Schedule, Term
+from holosplat.fit.terms import Objective
+from holosplat.geometry import Grid
+from holosplat.learning.start import images, seen_in
+from holosplat.matter import DeltaBeta, Matter
+from holosplat.methods.cross_validation import assumed_material
+from holosplat.methods.ground import ExtraTerm, ground
+from holosplat.methods.method import Method, Stage, Task, one_material
+from holosplat.methods.volume import binning
+from holosplat.planning.needs import Costs, Needs, Sizes
+from holosplat.ranges import Natural, Rate, Share, Weight, checked_dataclass
+from holosplat.representations import Stored
+from holosplat.scan import Scan
+
+from .fields import AlignedNetwork, PixelAligned, PixelAlignedField
+from .fields.neural_field import grown
+from .fields.terms import AlignedFrames, AlignedLines
+from .fields.weights import ONIX, PIXELNERF, read_aligned
+from .neural_fields import visual_hull
+
+
+class Bytes:
+    """Of memory, that the parts of a field take (`benchmarks/needs.py`)."""
+
+    points: float = 0.11e9
+    """The points that are evaluated at once, and the weights."""
+    voxel: float = 90.0
+    """A voxel, of which two in five show matter: a fifth more is taken where all do."""
+    place: float = 5.0
+    """A voxel in a view: where its shadow lies."""
+    features: float = 1500.0
+    """A pixel of the images: what the encoder makes of it, with gradients."""
 
 
 @checked_dataclass
@@ -102,6 +119,14 @@ class PixelAlignedMethod(Method):
         """The same method with `effort` times the steps, at least one."""
         return replace(self, fit=replace(self.fit, schedule=self.fit.schedule.with_effort(effort)))
 
+    def needs(self, sizes: Sizes) -> Needs:
+        """The field, its images and the waves (`planning.needs.Estimated`)."""
+        small = sizes.joined(self.fit.max_voxels)
+        seen = small.views * small.voxels
+        memory = Bytes.points + Bytes.voxel * small.voxels + Bytes.place * seen + Bytes.features * small.pixels
+        memory += Costs.waves * sizes.waves()
+        return Needs(memory, small.voxels, 5 + 0.9e-6 * self.fit.schedule.steps * seen)
+
 
 @dataclass(frozen=True)
 class Onix(PixelAlignedMethod):
@@ -121,6 +146,10 @@ class PixelNerf(PixelAlignedMethod):
 
     kind: ClassVar[str] = PIXELNERF
     name: ClassVar[str] = "pixel-aligned field of line integrals"
+
+
+ONIX_METHOD, PIXELNERF_METHOD = Onix(), PixelNerf()
+"""As `METHODS` has them."""
 
 
 @dataclass(frozen=True)
