@@ -10,8 +10,11 @@ import pytest
 
 from holosplat import plugins
 from holosplat.cli.entry import COMMANDS
+from holosplat.methods import METHODS
+from holosplat.planning.needs import Estimated
 from holosplat.plugins import Extended
 from holosplat.representations import KINDS
+from holosplat.training.train import NETWORKS
 
 
 @pytest.fixture
@@ -44,15 +47,24 @@ def test_a_name_that_nobody_has_is_none(table):
         table["e"]
 
 
-def test_the_benchmark_adds_its_command_and_kinds():
+def test_the_benchmark_adds_its_command_methods_networks_and_kinds():
     assert set(COMMANDS) - set(COMMANDS.own) == {"bench"}
     added = {name: KINDS[name] for name in KINDS if name not in KINDS.own}
     assert added
+    methods = {name: METHODS[name] for name in METHODS if name not in METHODS.own}
+    assert set(methods) == {"neural-field", "onix", "pinn", "pixelnerf"}
+    assert all(method.kind == name and isinstance(method, Estimated) for name, method in methods.items())
+    assert set(NETWORKS) - set(NETWORKS.own) == {"onix", "pixelnerf"}
     assert all(kind.kind == name and kind.__module__.startswith("holosplat_bench.") for name, kind in added.items())
 
 
 @pytest.mark.parametrize(
-    "code", ["import holosplat.representations", "from holosplat.cli.entry import command; command('info')"]
+    "code",
+    [
+        "import holosplat.representations",
+        "from holosplat.cli.entry import command; command('info')",
+        "from holosplat.methods.presets import chosen_method; chosen_method('volume', None, None)",
+    ],
 )
 def test_the_core_alone_does_not_load_the_benchmark(code):
     code += "; import sys; print(*(name for name in sys.modules if name.startswith('holosplat_bench')))"
