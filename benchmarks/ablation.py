@@ -28,10 +28,10 @@ import numpy as np
 from machine import commit
 
 import holosplat as hs
-from holosplat.beamline.declaration import Case
 from holosplat.methods import Task, finished
 from holosplat.methods.gaussians import GaussianStage
 from holosplat.workflows.evaluate import score_object
+from holosplat_bench.declaration import Case
 from holosplat_bench.suite.case import case_names, load_case
 
 AS_IT_IS = "as it is"

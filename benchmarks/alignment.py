@@ -25,11 +25,11 @@ from scipy.spatial.transform import Rotation
 import holosplat as hs
 from holosplat.align import PoseOptions, PosePrior, align_views
 from holosplat.align.derivatives import moved_onto
-from holosplat.beamline.declaration import Case
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.methods import Auto, Gaussians, Method
 from holosplat.metrics import volume_scores
 from holosplat.version import source_commit
+from holosplat_bench.declaration import Case
 from holosplat_bench.suite.case import load_case
 
 USUAL = PosePrior()

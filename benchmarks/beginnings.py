@@ -25,12 +25,12 @@ from machine import commit
 from rows import written
 
 import holosplat as hs
-from holosplat.beamline.declaration import Case
 from holosplat.methods import smooth_fit
 from holosplat.methods.illumination import prepared
 from holosplat.methods.method import Task, begun, run_quietly
 from holosplat.methods.volume import SmoothStage
 from holosplat.representations import Stored
+from holosplat_bench.declaration import Case
 from holosplat_bench.suite.case import load_case
 
 SCENES: tuple[tuple[str, int, float | None], ...] = (

@@ -15,8 +15,8 @@ from rows import read
 
 from holosplat.learning.start import SHIPPED, Card, read_weights, write_weights
 from holosplat.tables import from_table, to_table
-from holosplat.training.options import Ranges
-from holosplat.training.train import limits
+from holosplat_bench.training.options import Ranges
+from holosplat_bench.training.train import limits
 
 RUNS = Path(__file__).resolve().parents[1] / "docs" / "data" / "learned.csv"
 TAKEN = ("The run began with the", "start: network", "start: red cells")

@@ -22,8 +22,8 @@ from holosplat.io.vtk import read_meshes, write_mesh
 from holosplat.learning.start import read_weights
 from holosplat.mesh import TriangleMesh
 from holosplat.specimens.red_cells import random_cells
-from holosplat.training.folder import Dataset
 from holosplat.workflows.run_folder import check
+from holosplat_bench.training.folder import Dataset
 
 PIXEL, ROWS, COLUMNS = 3.2e-6, 18, 20
 MATERIAL = ["--material", "haemoglobin"]

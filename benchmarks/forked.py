@@ -151,7 +151,7 @@ def _code(act: Callable[[], None]) -> int:
 
 
 NEEDED = (
-    "beamline.declaration beamline.grow beamline.record beamline.simulate io.formats io.objects io.volumes "
+    "beamline.grow beamline.record beamline.simulate io.formats io.objects io.volumes "
     "io.nxtomo methods.presets report.run specimens.red_cells workflows.correct workflows.evaluate workflows.join "
     "workflows.reconstruct workflows.track report.content report.moving_figures align.views"
 )

@@ -36,8 +36,8 @@ from holosplat.methods.volume import material_of_levels
 from holosplat.metrics import volume_scores
 from holosplat.specimens.continuous import ContinuousScene
 from holosplat.specimens.scene import MeshScene
-from holosplat.training.options import Kind, Ranges
-from holosplat.training.sample import drawn_case
+from holosplat_bench.training.options import Kind, Ranges
+from holosplat_bench.training.sample import drawn_case
 from motion import MATERIAL, PHOTONS, PIXEL, SHAPE, cells_in_flow
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "data" / "learned.csv"

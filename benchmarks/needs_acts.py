@@ -25,7 +25,6 @@ from rows import read, write
 
 from holosplat.align import PoseOptions
 from holosplat.beamline.simulate import Simulation
-from holosplat.cli.learn import _needs
 from holosplat.geometry import Views
 from holosplat.io.vtk import write_mesh
 from holosplat.mesh import TriangleMesh
@@ -39,11 +38,12 @@ from holosplat.planning.needs import Sizes as NeedsSizes
 from holosplat.scan import Exposures
 from holosplat.specimens.membrane.rest import nodes_of
 from holosplat.specimens.red_cells import random_cells
-from holosplat.training.options import Ranges, TrainOptions
-from holosplat.training.train import trainer_of
+from holosplat_bench.cli.learn import _needs
 from holosplat_bench.suite.case import planned_frames
 from holosplat_bench.suite.methods import METHODS as BENCH_METHODS
 from holosplat_bench.suite.methods import of_methods
+from holosplat_bench.training.options import Ranges, TrainOptions
+from holosplat_bench.training.train import trainer_of
 
 PIXEL, STEP = 3.2e-6, 1e-4
 """Of frames [m], and between two times [s]."""

@@ -26,15 +26,15 @@ from machine import commit
 from rows import read, write
 
 import holosplat as hs
-from holosplat.beamline.declaration import Case
 from holosplat.geometry import Grid
-from holosplat.training.folder import Dataset, make_dataset
-from holosplat.training.options import FrameLossWeights, Ranges, TrainOptions, ViewSampling
-from holosplat.training.sample import drawn_case
-from holosplat.training.shown import Validation
-from holosplat.training.train import WEIGHTS, made_by
+from holosplat_bench.declaration import Case
 from holosplat_bench.opponents.onix import Onix
 from holosplat_bench.opponents.training import AlignedTraining, AlignedValidation
+from holosplat_bench.training.folder import Dataset, make_dataset
+from holosplat_bench.training.options import FrameLossWeights, Ranges, TrainOptions, ViewSampling
+from holosplat_bench.training.sample import drawn_case
+from holosplat_bench.training.shown import Validation
+from holosplat_bench.training.train import WEIGHTS, made_by
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "data" / "onix_scenes.csv"
 LEARNT = Ranges(rows=48, columns=48, views=4, across=(8.0, 16.0), noiseless=0.5, tilted=0.0)

@@ -35,12 +35,12 @@ import torch
 from machine import commit
 from rows import read, write
 
-from holosplat.beamline.declaration import Case
 from holosplat.beamline.simulate import Simulation, simulated_frames
 from holosplat.model import Instrument
 from holosplat.scan import Exposures
 from holosplat.specimens.continuous import ContinuousScene
 from holosplat.specimens.scene import MeshScene
+from holosplat_bench.declaration import Case
 from holosplat_bench.suite import multislice as other
 from holosplat_bench.suite.arena.cases import multislice_frames, raster
 from holosplat_bench.suite.case import case_names, load_case

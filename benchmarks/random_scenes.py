@@ -26,7 +26,11 @@ from machine import commit
 from rows import read, write
 
 import holosplat as hs
-from holosplat.beamline.declaration import (
+from holosplat.beamline.light import UnevenLight
+from holosplat.geometry import Grid
+from holosplat.metrics import volume_scores
+from holosplat.units import wavelength
+from holosplat_bench.declaration import (
     Beam,
     Case,
     Declaration,
@@ -36,10 +40,6 @@ from holosplat.beamline.declaration import (
     Substance,
     case_of,
 )
-from holosplat.beamline.light import UnevenLight
-from holosplat.geometry import Grid
-from holosplat.metrics import volume_scores
-from holosplat.units import wavelength
 from holosplat_bench.suite.families import KINDS, Draw, Room
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "data" / "random_scenes.csv"

@@ -17,8 +17,8 @@ import numpy as np
 from machine import commit
 from rows import written
 
-from holosplat.beamline.declaration import Case
 from holosplat.model import Instrument
+from holosplat_bench.declaration import Case
 from holosplat_bench.suite.case import load_case
 from holosplat_bench.thesis.configurations import PHYSICS
 

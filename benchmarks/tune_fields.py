@@ -28,13 +28,13 @@ import torch
 from changes import changed
 from machine import commit
 
-from holosplat.beamline.declaration import Case
 from holosplat.methods import Method, Task, VoxelFit, Voxels, finished
 from holosplat.methods.presets import preset
 from holosplat.methods.voxels import HolographicStage
 from holosplat.optics.sampling import fringe_sampling
 from holosplat.representations import Stored, VoxelGrid
 from holosplat.workflows.evaluate import score_object
+from holosplat_bench.declaration import Case
 from holosplat_bench.opponents.fields import Encoding, Network
 from holosplat_bench.opponents.neural_fields import NeuralFields, NeuralFit
 from holosplat_bench.suite.case import load_case

@@ -20,10 +20,10 @@ from machine import commit
 
 from holosplat.baselines import holographic_tv
 from holosplat.baselines.two_materials import Levels, best_levels
-from holosplat.beamline.declaration import Case
 from holosplat.matter import MaterialPrior
 from holosplat.methods.cross_validation import assumed_material
 from holosplat.methods.presets import preset
+from holosplat_bench.declaration import Case
 from holosplat_bench.suite.case import case_names, load_case
 
 

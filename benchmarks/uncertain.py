@@ -20,11 +20,11 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 from machine import commit
 
-from holosplat.beamline.declaration import Case
 from holosplat.matter import KnownRatio, MaterialPrior
 from holosplat.methods import Task
 from holosplat.methods.illumination import prepared
 from holosplat.methods.uncertain import Uncertain, determine
+from holosplat_bench.declaration import Case
 from holosplat_bench.suite.case import load_case
 
 COLUMNS = ("case", "seed", "uncertain", "constant", "over_truth", "low", "high", "told", "seconds", "commit")

@@ -14,7 +14,7 @@ from holosplat.methods import METHODS
 from holosplat.planning.needs import Estimated
 from holosplat.plugins import Extended
 from holosplat.representations import KINDS
-from holosplat.training.train import NETWORKS
+from holosplat_bench.training.train import NETWORKS
 
 
 @pytest.fixture
@@ -47,8 +47,8 @@ def test_a_name_that_nobody_has_is_none(table):
         table["e"]
 
 
-def test_the_benchmark_adds_its_command_methods_networks_and_kinds():
-    assert set(COMMANDS) - set(COMMANDS.own) == {"bench"}
+def test_the_benchmark_adds_its_commands_methods_networks_and_kinds():
+    assert set(COMMANDS) - set(COMMANDS.own) == {"bench", "dataset", "train"}
     added = {name: KINDS[name] for name in KINDS if name not in KINDS.own}
     assert added
     methods = {name: METHODS[name] for name in METHODS if name not in METHODS.own}

@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 import holosplat as hs
 from helpers.bench_shop import MATERIAL, PITCH
 from holosplat.align.derivatives import moved_onto
-from holosplat.beamline.declaration import Case
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.matter import Matter
 from holosplat.representations.voxels import VoxelGrid
 from holosplat.specimens.red_cells import icosphere
+from holosplat_bench.declaration import Case
 from holosplat_bench.suite.methods import ALIGNED, METHODS, by_mass, by_reprojection
 from holosplat_bench.suite.prepare import described, fingerprint
 from holosplat_bench.suite.run import Move, judged_with

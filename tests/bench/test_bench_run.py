@@ -14,12 +14,12 @@ from scipy.ndimage import gaussian_filter
 
 import holosplat as hs
 from helpers.bench_shop import MATERIAL, PITCH, Recorder, fail, make_case, suite, voxels
-from holosplat.beamline.declaration import Case
 from holosplat.matter import Matter
 from holosplat.optics.sampling import fringe_sampling
 from holosplat.representations import SurfaceMesh, VoxelGrid
 from holosplat.specimens.phantoms import star_of_balls
 from holosplat.workflows.evaluate import score_object
+from holosplat_bench.declaration import Case
 from holosplat_bench.opponents.fields import NeuralField
 from holosplat_bench.opponents.fields.neural_field import Network
 from holosplat_bench.suite import methods, run

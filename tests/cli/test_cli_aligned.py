@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from helpers.ball_sample import ball_sample
 from helpers.cli import holosplat, refused, worked
-from holosplat.training.folder import Dataset
-from holosplat.training.options import Ranges
 from holosplat_bench.opponents.fields import AlignedNetwork
 from holosplat_bench.opponents.fields.weights import read_aligned
+from holosplat_bench.training.folder import Dataset
+from holosplat_bench.training.options import Ranges
 
 
 def test_a_network_is_trained_and_the_method_of_its_name_takes_it(tmp_path, monkeypatch, shop, unjudged_runs):
@@ -15,7 +15,7 @@ def test_a_network_is_trained_and_the_method_of_its_name_takes_it(tmp_path, monk
     monkeypatch.setattr(Dataset, "read", lambda folder: Dataset(folder, Ranges(), 0, 4))
     monkeypatch.setattr(Dataset, "require_whole", lambda self: None)
     monkeypatch.setattr(Dataset, "sample", lambda self, index: sample)
-    monkeypatch.setattr("holosplat.training.shown.sample_of", lambda ranges, seed, index: sample)
+    monkeypatch.setattr("holosplat_bench.training.shown.sample_of", lambda ranges, seed, index: sample)
     options = ("--network", "pixelnerf", "--steps", "2", "--validation", "1", "--views", "2")
 
     worked(holosplat("train", tmp_path, "--out", tmp_path / "out", *options))

@@ -8,7 +8,7 @@ import torch
 from helpers.two_balls import ONE, PIXEL, scan, truth
 from holosplat.geometry import Grid
 from holosplat.learning.start import retrieved_thickness
-from holosplat.training.sample import Sample
+from holosplat_bench.training.sample import Sample
 
 
 def ball_sample() -> Sample:

@@ -10,11 +10,11 @@ import numpy as np
 import torch
 
 import holosplat as hs
-from holosplat.beamline.declaration import Case
 from holosplat.matter import Matter
 from holosplat.methods import Task
 from holosplat.representations.voxels import VoxelGrid
 from holosplat.specimens.red_cells import icosphere
+from holosplat_bench.declaration import Case
 from holosplat_bench.suite.methods import BenchMethod
 from holosplat_bench.suite.run import Suite
 

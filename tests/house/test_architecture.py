@@ -31,11 +31,11 @@ geometry frames divided_light scan volume mesh matter
 ← methods
 ← align motion
 ← workflows planning
-← report show training
+← report show
 ← series
 ← cli ← __main__
-← holosplat_bench/opponents
-← holosplat_bench/suite
+← holosplat_bench/declaration ← holosplat_bench/training
+← holosplat_bench/opponents ← holosplat_bench/suite
 ← holosplat_bench/thesis
 ← holosplat_bench/cli
 """
@@ -54,7 +54,7 @@ BACKEND_IMPORTS = {
 
 HEAVY: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("vtk", "vtkmodules", "trimesh", "skimage", "viser", "websockets", "zarr", "numcodecs"), ()),
-    "matplotlib": ("report", "holosplat_bench/suite/pages", "holosplat_bench/thesis/pages"),
+    "matplotlib": ("report", "holosplat_bench/suite/pages", "holosplat_bench/thesis/pages", "holosplat_bench/cli"),
     "jinja2": ("report",),
     "tyro": ("cli", "holosplat_bench/cli"),
 }

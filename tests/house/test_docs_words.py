@@ -69,7 +69,8 @@ BANNED = (
 SOURCE = ROOT / "src" / "holosplat"
 PLAIN_ROOMS = (
     *("align", "beamline", "bodies", "learning", "metrics", "model", "motion", "optics", "planning", "preprocess"),
-    *("projectors", "report", "representations", "series", "show", "specimens", "training", "fit", "workflows"),
+    *("projectors", "report", "representations", "series", "show", "specimens", "fit", "workflows"),
+    *("../holosplat_bench/training", "../holosplat_bench/opponents/fields"),
 )
 """Rooms whose docstrings have none of the constructions; the list only grows."""
 BANNED_FIRST = (

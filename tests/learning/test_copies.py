@@ -8,8 +8,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from holosplat.learning.network import COPIES
-from holosplat.training.sample import Sample
-from holosplat.training.shown import example_of_views, make_example
+from holosplat_bench.training.sample import Sample
+from holosplat_bench.training.shown import example_of_views, make_example
 
 VIEWS = np.arange(3)
 

@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from holosplat.learning.start import SHIPPED, read_weights
-from holosplat.training.options import Ranges, TrainOptions
-from holosplat.training.sample import sample_of
-from holosplat.training.shown import dice, example_of_views
+from holosplat_bench.training.options import Ranges, TrainOptions
+from holosplat_bench.training.sample import sample_of
+from holosplat_bench.training.shown import dice, example_of_views
 
 CELLS = Ranges(
     rows=48, columns=48, views=4, held_out=1, tilted=0.0, noiseless=1.0, across=(12.0, 14.0), fresnel=(0.02, 0.1)

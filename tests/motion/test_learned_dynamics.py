@@ -39,9 +39,9 @@ from holosplat.motion.learned import (
 )
 from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.specimens.red_cells import icosphere
-from holosplat.training.dynamics import DynamicsTraining, FlowSeries, _noise, draw_lesson, train_dynamics
-from holosplat.training.options import TrainOptions
 from holosplat.workflows.forecast import ForecastOptions, _others, require_cells
+from holosplat_bench.training.dynamics import DynamicsTraining, FlowSeries, _noise, draw_lesson, train_dynamics
+from holosplat_bench.training.options import TrainOptions
 
 SPHERE, FACES = icosphere(2)
 TIMES = 1e-5 * np.arange(12)
@@ -255,7 +255,7 @@ def series(tmp_path_factory) -> Path:
 
 @pytest.fixture(autouse=True)
 def _small(monkeypatch):
-    monkeypatch.setattr("holosplat.training.dynamics.SIZE", SIZE)
+    monkeypatch.setattr("holosplat_bench.training.dynamics.SIZE", SIZE)
 
 
 OPTIONS = TrainOptions(steps=4, keep_every=2, warm_up=1, network="dynamics")

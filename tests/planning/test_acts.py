@@ -15,7 +15,7 @@ import pytest
 
 from holosplat.align import PoseOptions
 from holosplat.geometry import Views
-from holosplat.learning.network import FINE, Size
+from holosplat.learning.network import Size
 from holosplat.methods import METHODS, SurfaceOptions
 from holosplat.motion.flow_reconstruction import FlowOptions
 from holosplat.motion.track_linking import TrackOptions
@@ -23,9 +23,10 @@ from holosplat.planning import acts
 from holosplat.planning.needs import Needs, Sizes, of_fit, of_reconstruction
 from holosplat.planning.scan_facts import coarser
 from holosplat.scan import Exposures
-from holosplat.training.options import TrainOptions
-from holosplat.training.train import trainer_of
 from holosplat_bench.suite.methods import of_benchmark, of_methods
+from holosplat_bench.training.needs import of_dataset, of_training
+from holosplat_bench.training.options import TrainOptions
+from holosplat_bench.training.train import trainer_of
 
 ROOT = Path(__file__).resolve().parents[2]
 TABLE = ROOT / "docs/data/needs_acts.csv"
@@ -115,18 +116,17 @@ def test_cells_in_flow_take_room_for_every_mesh_and_pairs_of_their_nodes():
 
 def test_scenes_take_as_many_times_the_memory_as_there_are_processes():
     simulated = Needs(5e8, 0.0)
-    one, four = (acts.of_dataset(simulated, (48, 61), 5, 100, jobs) for jobs in (1, 4))
+    one, four = (of_dataset(simulated, (48, 61), 5, 100, jobs) for jobs in (1, 4))
     assert four.memory > 4 * one.memory
     assert four.disk == one.disk
     assert four.seconds == pytest.approx(one.seconds / 4)
 
 
 def test_a_wider_network_and_more_views_take_more():
-    assert acts.LATTICE == FINE**3
     sizes = ((64, 81), 3)
-    plain = acts.of_training(*sizes, Size(), 100)
-    wide = acts.of_training(*sizes, Size(volume=(32, 80, 160)), 100)
-    more = acts.of_training((64, 81), 6, Size(), 100)
+    plain = of_training(*sizes, Size(), 100)
+    wide = of_training(*sizes, Size(volume=(32, 80, 160)), 100)
+    more = of_training((64, 81), 6, Size(), 100)
     assert wide.memory > plain.memory < more.memory
     for network in ("onix", "pixelnerf"):
         few, many = (trainer_of(network).needs((64, 81), views, TrainOptions(network=network)) for views in (3, 6))

@@ -68,10 +68,10 @@ GROUPS: dict[str, dict[str, str]] = {
         "compare": "view",
     },
     "Series": {"series": "series", "watch": "series", "forecast": "forecast"},
-    "Learn": {"dataset": "learn", "train": "learn"},
+    "Learn": {},
     "Benchmark and installation": {"demo": "commands", "doctor": "data", "backends": "commands"},
 }
-"""Heading of the overview → its commands, each with its module; what other packages add stands first under the last."""
+"""Heading of the overview → its commands, each with its module; what other packages add stands first."""
 
 
 @cache
@@ -87,11 +87,15 @@ def _summary(name: str, module: str) -> str:
 
 
 COMMANDS = Extended(
-    {name: (module, _summary(name, module)) for names in GROUPS.values() for name, module in names.items()},
+    {
+        name: (module, _summary(name, module), heading)
+        for heading, names in GROUPS.items()
+        for name, module in names.items()
+    },
     "holosplat.commands",
 )
 """Name → (module that has a function of that name, by its whole name in other packages; the docstring's first
-paragraph)."""
+paragraph; the heading in the overview)."""
 DESCRIPTION = "Quantitative 3D maps from a handful of X-ray phase-contrast images."
 
 
@@ -163,10 +167,11 @@ def _explained(arguments: list[str]) -> bool:
 
 def _groups() -> dict[str, list[tuple[str, str]]]:
     """The overview: heading → names of commands and what they do."""
-    added = [name for name in COMMANDS if name not in COMMANDS.own]
-    groups = {heading: [(name, COMMANDS[name][1]) for name in names] for heading, names in GROUPS.items()}
-    last = list(groups)[-1]
-    return {**groups, last: [*((name, COMMANDS[name][1]) for name in added), *groups[last]]}
+    groups: dict[str, list[tuple[str, str]]] = {heading: [] for heading in GROUPS}
+    for name in sorted(COMMANDS, key=lambda name: name in COMMANDS.own):
+        _, summary, heading = COMMANDS[name]
+        groups.setdefault(heading, []).append((name, summary))
+    return groups
 
 
 def _require_no_empty(arguments: list[str]) -> None:
@@ -195,7 +200,7 @@ def _functions(arguments: list[str]) -> dict[str, Callable[..., None]]:
     """A function for each command, which does nothing but have a summary unless the first argument names it."""
     known = COMMANDS.own if arguments[:1] and arguments[0] in COMMANDS.own else COMMANDS
     found: dict[str, Callable[..., None]] = {}
-    for name, (_, summary) in known.items():
+    for name, (_, summary, _) in known.items():
 
         def unloaded() -> None:
             pass

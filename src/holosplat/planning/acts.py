@@ -19,7 +19,6 @@ from .needs import KEPT, Costs, Needs, Sizes, of_fit, of_start, with_report
 
 if TYPE_CHECKING:
     from ..align import PoseOptions
-    from ..learning.network import Size
     from ..matter import MatterKind
     from ..methods import Method
     from ..methods.surface_fit import SurfaceOptions
@@ -27,17 +26,12 @@ if TYPE_CHECKING:
     from ..motion.track_linking import TrackOptions
     from ..scan import Exposures
 
-LATTICE = 8
-"""Voxels for one of the lattice of the network of `--start learned`."""
-
 
 class Parts:
     """Bytes of memory and seconds that the parts of these commands take, beside those of `Costs`."""
 
     plain_program: float = 0.37e9
     """The program without what fits need."""
-    trainer: float = 0.61e9
-    """The program while it trains, with its optimiser and what PyTorch compiles."""
     drawn: float = 0.63e9
     """All of it while a report is drawn of one of several times."""
     search: float = 0.54e9
@@ -48,10 +42,6 @@ class Parts:
     """A voxel of matter in motion: L-BFGS, gradients and priors."""
     sources: float = 14.0
     """The same voxel at each time: where the flow brought it from."""
-    channel: float = 37.0
-    """A channel of a voxel of the lattice of a network in training."""
-    lifted: float = 49.0
-    """A channel that is lifted from a view into such a voxel."""
     node_pairs: float = 10.0
     """A pair of nodes of two cells in flow, whose block is computed at once."""
     exported: float = 25.0
@@ -60,8 +50,6 @@ class Parts:
     """A voxel of a slab of one."""
     halved: float = 14.0
     """A voxel of chunks of which larger voxels are made."""
-    scene: float = 8.0
-    """A voxel of a scene for learning, of which a file's are held."""
 
 
 class Room:
@@ -71,10 +59,6 @@ class Room:
     """A node of a mesh file, with its triangles."""
     nodes: float = 4.0
     """Nodes of all surfaces, for each pixel of a frame, by and large."""
-    scene_pixel: float = 4.0
-    """A pixel of a frame of a scene for learning."""
-    scene_voxel: float = 0.05
-    """A voxel of its occupancy."""
 
 
 def of_simulation(exposures: Exposures, samples: int, frames: int) -> Needs:
@@ -171,22 +155,3 @@ def of_growth(cells: int, nodes: int, snapshots: int, travel: float) -> Needs:
     seconds = 2 + 2.5e-8 * steps * (cells * nodes) ** 2
     disk = Room.node * nodes * cells * snapshots + 1e5
     return Needs(Costs.program + Parts.node_pairs * nodes**2, disk, seconds)
-
-
-def of_dataset(simulated: Needs, shape: tuple[int, int], views: int, scenes: int, jobs: int) -> Needs:
-    """What `dataset` takes in so many processes for scenes of so many views, each `simulated` at what it takes most."""
-    rows, columns = shape
-    pixels, voxels = views * rows * columns, rows * columns**2
-    memory = simulated.memory + Parts.plain_program - Costs.program + Parts.scene * voxels
-    disk = scenes * (Room.scene_pixel * pixels + Room.scene_voxel * voxels) + 1e5
-    return Needs(jobs * memory + (jobs > 1) * Costs.program, disk, 1.5e-4 * scenes * pixels / jobs)
-
-
-def of_training(shape: tuple[int, int], views: int, size: Size, steps: int) -> Needs:
-    """Estimate resources of `train` of the network of `--start learned`, of a certain size, for scenes of so many
-    pixels and shown views."""
-    voxels = shape[0] * shape[1] ** 2
-    lattice = voxels / LATTICE
-    channels = sum(width / 8**level for level, width in enumerate(size.volume)) + 3 * size.features
-    memory = Parts.trainer + (Parts.channel * channels + Parts.lifted * size.features * views) * lattice
-    return Needs(memory, 1e8, steps * (0.2 + 2e-5 * views * lattice))

@@ -105,9 +105,9 @@ def run(
         retry: Run again what failed.
         list_only: Only list cases and methods.
     """
-    from holosplat.beamline.declaration import Case
     from holosplat.io.lock import sole_writer
 
+    from ..declaration import Case
     from ..suite.case import case_names, load_case
     from ..suite.folder import BenchFolder
     from ..suite.methods import ALIGNED, METHODS, REFERENCES

@@ -23,12 +23,12 @@ from holosplat.optics.sampling import fringe_sampling
 from holosplat.planning.needs import Needs
 from holosplat.representations import VoxelGrid
 from holosplat.scan import Exposures
-from holosplat.training.folder import Dataset
-from holosplat.training.options import TrainOptions, ViewSampling
-from holosplat.training.sample import Sample, SampleScan, as_scan
-from holosplat.training.shown import Validation, share_of_overlap
-from holosplat.training.train import BETAS, PURPOSE, Trainer, Training
 
+from ..training.folder import Dataset
+from ..training.options import TrainOptions, ViewSampling
+from ..training.sample import Sample, SampleScan, as_scan
+from ..training.shown import Validation, share_of_overlap
+from ..training.train import BETAS, PURPOSE, Trainer, Training
 from .fields import AlignedNetwork, PixelAligned, PixelAlignedField
 from .fields.neural_field import grown
 from .fields.weights import ONIX, PIXELNERF, write_aligned

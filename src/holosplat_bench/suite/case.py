@@ -15,7 +15,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from holosplat.beamline.declaration import Case, Declaration, Listed, case_of
 from holosplat.checks import InputError, in_range, require, whole_seed
 from holosplat.geometry import rotation_y
 from holosplat.io.vtk import SUFFIXES, read_meshes
@@ -39,6 +38,8 @@ from holosplat.specimens.phantoms import star_of_balls
 from holosplat.specimens.repair import closed
 from holosplat.specimens.soft_matter import body_with_absorber, coated_droplets, round_cell, shepp_logan, tissue
 from holosplat.tables import from_table, merged, read_table
+
+from ..declaration import Case, Declaration, Listed, case_of
 
 
 @checked_dataclass

@@ -16,7 +16,6 @@ from holosplat.align.derivatives import blurred, in_pixels, projections
 from holosplat.align.find import align_views
 from holosplat.align.initial_geometry import shifts_by_mass
 from holosplat.baselines import TOMOGRAPHIES
-from holosplat.beamline.declaration import Case
 from holosplat.checks import require
 from holosplat.geometry import Grid
 from holosplat.matter import Known, MaterialPrior, Matter
@@ -42,6 +41,7 @@ from holosplat.scan import Exposures, Scan
 from holosplat.volume import Object, Volume
 from holosplat.workflows.reconstruct import reconstruct
 
+from ..declaration import Case
 from ..opponents.mbir import MbirPerView
 from ..opponents.neural_fields import NeuralFields
 from ..opponents.onix import Onix, PixelNerf

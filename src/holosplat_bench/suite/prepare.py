@@ -14,7 +14,6 @@ import numpy as np
 import torch
 
 from holosplat.baselines.algebraic import filtered_backprojection
-from holosplat.beamline.declaration import Case
 from holosplat.beamline.light import EVEN_LIGHT, UnevenLight
 from holosplat.beamline.misalignment import AS_PLANNED, Misalignment
 from holosplat.checks import InputError, require
@@ -33,6 +32,8 @@ from holosplat.units import wavenumber
 from holosplat.volume import Volume
 from holosplat.workflows.correct import CorrectionOptions, correct
 from holosplat.workflows.provenance import scan_hash
+
+from ..declaration import Case
 
 DARKEST = 1e-3
 """Relative intensity below which a pixel counts as so bright: its logarithm has no meaning."""

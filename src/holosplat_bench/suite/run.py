@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 from holosplat.align.held_out import place_frames
 from holosplat.align.poses import PoseOptions
 from holosplat.backends import resolve
-from holosplat.beamline.declaration import Case
 from holosplat.checks import InputError, reason_of, require
 from holosplat.metrics import resolution
 from holosplat.optics.sampling import fringe_sampling
@@ -37,6 +36,7 @@ from holosplat.volume import Object, Volume
 from holosplat.workflows.evaluate import Scores, score_object
 from holosplat.workflows.provenance import environment, scan_hash
 
+from ..declaration import Case
 from ..opponents.fields import NeuralField, PixelAlignedField
 from .arena.contest import status_bytes
 from .folder import BenchFolder, Row, good_name

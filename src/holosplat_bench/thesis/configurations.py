@@ -13,7 +13,6 @@ from typing import Literal
 
 import numpy as np
 
-from holosplat.beamline.declaration import Case
 from holosplat.checks import InputError, at_least, require
 from holosplat.fit.density import DensityControl
 from holosplat.fit.problem import Schedule
@@ -24,6 +23,8 @@ from holosplat.methods.presets import preset
 from holosplat.ranges import checked_dataclass
 from holosplat.scan import Scan
 from holosplat.volume import Object, Volume
+
+from ..declaration import Case
 
 
 @checked_dataclass

@@ -16,9 +16,6 @@ from holosplat.fit.problem import Schedule
 from holosplat.learning.start import Card, write_weights
 from holosplat.matter import MaterialPrior
 from holosplat.methods import Task, solve
-from holosplat.training.folder import Dataset
-from holosplat.training.options import FrameLossWeights, Ranges, TrainOptions, ViewSampling
-from holosplat.training.sample import Sample
 from holosplat_bench.opponents.fields import AlignedNetwork, PixelAligned, PixelAlignedField
 from holosplat_bench.opponents.fields.weights import read_aligned, write_aligned
 from holosplat_bench.opponents.onix import AlignedFit, Onix, PixelNerf
@@ -29,6 +26,9 @@ from holosplat_bench.opponents.training import (
     draw_aligned_example,
     first_views,
 )
+from holosplat_bench.training.folder import Dataset
+from holosplat_bench.training.options import FrameLossWeights, Ranges, TrainOptions, ViewSampling
+from holosplat_bench.training.sample import Sample
 
 SMALL = AlignedNetwork((4, 6), 8, 2)
 OPTIONS = TrainOptions(

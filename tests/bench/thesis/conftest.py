@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from holosplat.beamline.declaration import Case
 from holosplat.geometry import Views
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.matter import MaterialPrior
@@ -15,6 +14,7 @@ from holosplat.mesh import TriangleMesh
 from holosplat.scan import Exposures, interleaved_split
 from holosplat.specimens.red_cells import icosphere
 from holosplat.specimens.scene import MeshScene
+from holosplat_bench.declaration import Case
 from holosplat_bench.thesis.configurations import THESIS_TABLE, Configuration, Measured
 
 

@@ -12,13 +12,16 @@ from typing import ClassVar, Literal, Protocol
 
 import numpy as np
 
-from ..checks import in_range, require, shaped, whole_seed
-from ..geometry import Grid, Views, rotation_tilted
-from ..materials import DeltaBeta, parse_material
-from ..matter import MaterialPrior
-from ..optics.noise import PHOTON_RANGE
-from ..optics.propagation import poisson
-from ..ranges import (
+from holosplat.beamline.light import EVEN_LIGHT, UnevenLight
+from holosplat.beamline.misalignment import AS_PLANNED, Misalignment
+from holosplat.beamline.simulate import simulate
+from holosplat.checks import in_range, require, shaped, whole_seed
+from holosplat.geometry import Grid, Views, rotation_tilted
+from holosplat.materials import DeltaBeta, parse_material
+from holosplat.matter import MaterialPrior
+from holosplat.optics.noise import PHOTON_RANGE
+from holosplat.optics.propagation import poisson
+from holosplat.ranges import (
     Grams,
     Metres,
     Photons,
@@ -28,15 +31,12 @@ from ..ranges import (
     Small,
     checked_dataclass,
 )
-from ..scan import Exposures, Scan
-from ..specimens.drawn import Scene, Substances
-from ..specimens.matter import ContinuousKind, Declarable, FieldMatter
-from ..specimens.phantoms import Ball
-from ..specimens.scene import MeshScene
-from ..volume import Volume
-from .light import EVEN_LIGHT, UnevenLight
-from .misalignment import AS_PLANNED, Misalignment
-from .simulate import simulate
+from holosplat.scan import Exposures, Scan
+from holosplat.specimens.drawn import Scene, Substances
+from holosplat.specimens.matter import ContinuousKind, Declarable, FieldMatter
+from holosplat.specimens.phantoms import Ball
+from holosplat.specimens.scene import MeshScene
+from holosplat.volume import Volume
 
 MOST_PIXELS = 4096
 

@@ -15,11 +15,11 @@ from holosplat.checks import InputError
 from holosplat.geometry import rotation_y
 from holosplat.learning.network import Size
 from holosplat.learning.start import read_weights
-from holosplat.training.folder import Dataset
-from holosplat.training.options import LossWeights, Ranges, TrainOptions, ViewSampling
-from holosplat.training.sample import Sample
-from holosplat.training.shown import Validation, dice, example_of_views, loss, soft_dice
-from holosplat.training.train import Training
+from holosplat_bench.training.folder import Dataset
+from holosplat_bench.training.options import LossWeights, Ranges, TrainOptions, ViewSampling
+from holosplat_bench.training.sample import Sample
+from holosplat_bench.training.shown import Validation, dice, example_of_views, loss, soft_dice
+from holosplat_bench.training.train import Training
 
 OPTIONS = TrainOptions(
     steps=6,

@@ -15,19 +15,20 @@ import torch
 from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
 
-from ..backends import require_device
-from ..checks import InputError, as_written, require
-from ..io.atomic import read_json, write_json, write_state
-from ..learning.network import Guess
-from ..learning.start import Card, write_weights
-from ..planning.acts import of_training
-from ..planning.needs import Needs
-from ..plugins import Extended
-from ..tables import to_table
-from ..version import source_commit
-from ..workflows.provenance import environment
-from ..workflows.run_folder import checkpoint_state
+from holosplat.backends import require_device
+from holosplat.checks import InputError, as_written, require
+from holosplat.io.atomic import read_json, write_json, write_state
+from holosplat.learning.network import Guess
+from holosplat.learning.start import Card, write_weights
+from holosplat.planning.needs import Needs
+from holosplat.plugins import Extended
+from holosplat.tables import to_table
+from holosplat.version import source_commit
+from holosplat.workflows.provenance import environment
+from holosplat.workflows.run_folder import checkpoint_state
+
 from .folder import Dataset
+from .needs import of_training
 from .options import Ranges, TrainOptions
 from .sample import Sample
 from .shown import Judge, Validation, draw_example, loss, write_numbers

@@ -8,14 +8,16 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from ..ranges import Jobs, Seed, Within
+from holosplat.cli.places import Kept, Output
+from holosplat.cli.progress import ProgressBar
+from holosplat.cli.sentence import interruptible, tell
+from holosplat.ranges import Jobs, Seed, Within
+
 from ..training.options import Ranges, TrainOptions
-from .places import Kept, Output
-from .progress import ProgressBar
-from .sentence import interruptible, tell
 
 if TYPE_CHECKING:
-    from ..planning.needs import Needs
+    from holosplat.planning.needs import Needs
+
     from ..training.train import Training
 
 Layout = Literal["nerf-synthetic", "r2-gaussian", "onix"]
@@ -63,8 +65,10 @@ def dataset(
 
 def _needs(drawn: Ranges, scenes: int, jobs: int) -> Needs:
     """What so many scenes take."""
-    from ..beamline.simulate import Simulation
-    from ..planning.acts import of_dataset, of_simulation
+    from holosplat.beamline.simulate import Simulation
+    from holosplat.planning.acts import of_simulation
+
+    from ..training.needs import of_dataset
 
     views = drawn.views + drawn.held_out
     ends = (of_simulation(each, Simulation().samples(each), views) for each in drawn.extremes())
@@ -87,9 +91,9 @@ def train(
         out: Folder to make.
         resume: Go on with an interrupted training; --resume FOLDER alone, with its scenes and options.
     """
-    from ..report.curves import training_curves
     from ..training.dynamics import train_dynamics
     from ..training.train import made_by, trainer_of
+    from .curves import training_curves
 
     who = made_by(how.device)  # before files change under hours of work
     if how.network == "dynamics":

@@ -8,12 +8,13 @@ from typing import Literal
 
 import numpy as np
 
-from ..checks import require
-from ..io.atomic import atomic_folder, write_json
-from ..io.nerf_synthetic import camera_poses, write_nerf_synthetic
-from ..io.r2_gaussian import R2Options, write_r2_gaussian
-from ..progress import Advance
-from ..units import wavenumber
+from holosplat.checks import require
+from holosplat.io.atomic import atomic_folder, write_json
+from holosplat.io.nerf_synthetic import camera_poses, write_nerf_synthetic
+from holosplat.io.r2_gaussian import R2Options, write_r2_gaussian
+from holosplat.progress import Advance
+from holosplat.units import wavenumber
+
 from .folder import Dataset
 from .sample import SampleScan, as_scan
 

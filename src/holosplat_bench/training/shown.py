@@ -13,10 +13,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from ..geometry import Grid, Views
-from ..io.atomic import write_rows
-from ..learning.network import FINE, Guess, Taps
-from ..learning.start import Card, images, unexplained
+from holosplat.geometry import Grid, Views
+from holosplat.io.atomic import write_rows
+from holosplat.learning.network import FINE, Guess, Taps
+from holosplat.learning.start import Card, images, unexplained
+
 from .options import LossWeights, Ranges, ViewSampling
 from .sample import Sample, sample_of
 

@@ -10,20 +10,21 @@ from typing import Literal
 import numpy as np
 import torch
 
-from ..beamline.declaration import Beam, Case, Declaration, Detector, Listed, Matter, Substance, case_of
-from ..beamline.light import UnevenLight
-from ..beamline.misalignment import Misalignment
-from ..checks import InputError
-from ..geometry import Grid, Views
-from ..learning.start import retrieved_thickness
-from ..matter import DeltaBeta
-from ..optics.noise import noise_levels
-from ..scan import Exposures, Scan
-from ..specimens.matter import Capsules, CrowdedCells, Declarable, FoamDrop, RedCells, SoftCells
-from ..specimens.red_cells import DIAMETER, evans_fung_cell
-from ..specimens.scene import MeshScene
-from ..units import wavelength
-from ..volume import Volume
+from holosplat.beamline.light import UnevenLight
+from holosplat.beamline.misalignment import Misalignment
+from holosplat.checks import InputError
+from holosplat.geometry import Grid, Views
+from holosplat.learning.start import retrieved_thickness
+from holosplat.matter import DeltaBeta
+from holosplat.optics.noise import noise_levels
+from holosplat.scan import Exposures, Scan
+from holosplat.specimens.matter import Capsules, CrowdedCells, Declarable, FoamDrop, RedCells, SoftCells
+from holosplat.specimens.red_cells import DIAMETER, evans_fung_cell
+from holosplat.specimens.scene import MeshScene
+from holosplat.units import wavelength
+from holosplat.volume import Volume
+
+from ..declaration import Beam, Case, Declaration, Detector, Listed, Matter, Substance, case_of
 from .options import Kind, Ranges
 
 PURPOSE = 2101

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from holosplat.training.options import Ranges
-from holosplat.training.train import limits
+from holosplat_bench.training.options import Ranges
+from holosplat_bench.training.train import limits
 
 SCORES = {"2": {"dice": 0.514, "scenes": 7.0}, "3": {"dice": 0.4, "scenes": 7.0}}
 

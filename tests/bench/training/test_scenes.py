@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from torch.nn.functional import avg_pool2d
 
-from holosplat.beamline.declaration import Matter, Substance, case_of
 from holosplat.checks import InputError
 from holosplat.learning.network import FINE, coarse, thickness_of
 from holosplat.materials import DeltaBeta
 from holosplat.specimens.drawn import Substances
 from holosplat.specimens.fluids import Bubbles
-from holosplat.training.folder import Dataset, write_datasheet
-from holosplat.training.options import Ranges
-from holosplat.training.sample import Sample, draw_scene, sample_of
-from holosplat.training.shown import make_example
+from holosplat_bench.declaration import Matter, Substance, case_of
+from holosplat_bench.training.folder import Dataset, write_datasheet
+from holosplat_bench.training.options import Ranges
+from holosplat_bench.training.sample import Sample, draw_scene, sample_of
+from holosplat_bench.training.shown import make_example
 
 WATER = Substance("H2O", 1.0)
 TINY = Ranges(rows=34, columns=30, views=3, held_out=1, across=(9.0, 11.0), fresnel=(0.02, 0.1), noiseless=1.0)
@@ -117,8 +117,8 @@ def test_a_dataset_goes_on_with_what_it_lacks_and_is_no_other(tmp_path, monkeypa
         made.append(index)
         return sample
 
-    monkeypatch.setattr("holosplat.training.folder.sample_of", simulated)
-    monkeypatch.setattr("holosplat.training.folder.SHARD", 2)
+    monkeypatch.setattr("holosplat_bench.training.folder.sample_of", simulated)
+    monkeypatch.setattr("holosplat_bench.training.folder.SHARD", 2)
     dataset = Dataset(tmp_path / "data", TINY, 3, 3)
     dataset.begin()
     dataset.make(dataset.missing()[0])

@@ -6,12 +6,24 @@ import math
 from dataclasses import field
 from typing import Literal
 
-from ..checks import at_least, require
-from ..geometry import Views
-from ..learning.network import Size
-from ..ranges import Angle, Many, Natural, Pixels, Positive, Rate, Seed, Share, SomeShare, Weight, checked_dataclass
-from ..scan import Exposures
-from ..units import wavelength
+from holosplat.checks import at_least, require
+from holosplat.geometry import Views
+from holosplat.learning.network import Size
+from holosplat.ranges import (
+    Angle,
+    Many,
+    Natural,
+    Pixels,
+    Positive,
+    Rate,
+    Seed,
+    Share,
+    SomeShare,
+    Weight,
+    checked_dataclass,
+)
+from holosplat.scan import Exposures
+from holosplat.units import wavelength
 
 Kind = Literal["red-cells", "crowd", "ellipsoids", "capsules", "filled-capsules", "foam", "soft-cells"]
 """What a scene may be made of."""

@@ -17,14 +17,14 @@ from helpers.pretended_gpu import OnGpu, pretended_gpu
 from holosplat.checks import InputError
 from holosplat.learning.network import Size
 from holosplat.learning.start import read_weights
-from holosplat.training.folder import Dataset
-from holosplat.training.options import FrameLossWeights, Ranges, TrainOptions, ViewSampling
-from holosplat.training.sample import Sample
-from holosplat.training.shown import Validation
-from holosplat.training.train import Training
 from holosplat_bench.opponents.fields import AlignedNetwork
 from holosplat_bench.opponents.fields.weights import read_aligned
 from holosplat_bench.opponents.training import AlignedTraining, AlignedValidation
+from holosplat_bench.training.folder import Dataset
+from holosplat_bench.training.options import FrameLossWeights, Ranges, TrainOptions, ViewSampling
+from holosplat_bench.training.sample import Sample
+from holosplat_bench.training.shown import Validation
+from holosplat_bench.training.train import Training
 
 pytest.importorskip("triton")
 

@@ -14,13 +14,13 @@ import torch
 from numpy.polynomial import legendre
 from torch import Tensor, nn
 
-from ..beamline.grow import SeriesFolder, read_compact
-from ..checks import as_written, require
-from ..io.atomic import read_json
-from ..learning.start import Card
-from ..mesh import ball_radius
-from ..motion.elastic import vertex_normals
-from ..motion.learned import (
+from holosplat.beamline.grow import SeriesFolder, read_compact
+from holosplat.checks import as_written, require
+from holosplat.io.atomic import read_json
+from holosplat.learning.start import Card
+from holosplat.mesh import ball_radius
+from holosplat.motion.elastic import vertex_normals
+from holosplat.motion.learned import (
     DEGREE,
     LONGEST,
     RELAXATION,
@@ -32,6 +32,7 @@ from ..motion.learned import (
     spread_of,
     write_dynamics,
 )
+
 from .shown import Judge
 from .train import WEIGHTS, Training
 

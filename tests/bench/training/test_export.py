@@ -12,10 +12,10 @@ from PIL import Image
 
 from holosplat.checks import InputError
 from holosplat.geometry import rotation_tilted
-from holosplat.training.export import export
-from holosplat.training.folder import Dataset
-from holosplat.training.options import Ranges
-from holosplat.training.sample import Sample, as_scan
+from holosplat_bench.training.export import export
+from holosplat_bench.training.folder import Dataset
+from holosplat_bench.training.options import Ranges
+from holosplat_bench.training.sample import Sample, as_scan
 
 ANGLES = (0.0, 70.0, 110.0)
 PIXEL, ENERGY, DISTANCE, DELTA, BETA = 0.5e-6, 20.0, 0.05, 3e-7, 4e-10

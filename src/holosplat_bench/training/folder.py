@@ -16,13 +16,14 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset as TorchDataset
 
-from ..checks import InputError, require
-from ..io.atomic import atomic_path, read_json, write_json
-from ..io.hdf5 import Fields, new_hdf5, open_hdf5
-from ..io.provenance import command_now, take_up
-from ..progress import Advance
-from ..tables import from_table, to_table
-from ..version import __version__
+from holosplat.checks import InputError, require
+from holosplat.io.atomic import atomic_path, read_json, write_json
+from holosplat.io.hdf5 import Fields, new_hdf5, open_hdf5
+from holosplat.io.provenance import command_now, take_up
+from holosplat.progress import Advance
+from holosplat.tables import from_table, to_table
+from holosplat.version import __version__
+
 from .options import Ranges
 from .sample import Sample, sample_of
 

@@ -8,9 +8,9 @@ import torch
 from torch.utils.data import DataLoader
 
 from holosplat.checks import InputError
-from holosplat.training.folder import Dataset, Scenes, tensors_of
-from holosplat.training.options import Ranges
-from holosplat.training.sample import Sample, sample_of
+from holosplat_bench.training.folder import Dataset, Scenes, tensors_of
+from holosplat_bench.training.options import Ranges
+from holosplat_bench.training.sample import Sample, sample_of
 
 TINY = Ranges(rows=24, columns=24, views=2, held_out=1, across=(8.0, 10.0), fresnel=(0.05, 0.2), filled=(0.01, 0.02))
 
