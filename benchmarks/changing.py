@@ -42,10 +42,11 @@ from holosplat.series.events import History, Parts
 from holosplat.series.folder import SeriesFolder, line_of, read_row
 from holosplat.series.plan import Cut, Settings, plan_series
 from holosplat.series.run import run_left
-from holosplat.specimens import ChangingScene, ExpandingShock
+from holosplat.specimens import ChangingScene
 from holosplat.specimens.drawn import Drawn, Substances
-from holosplat.specimens.matter import CHANGING, Changing
 from holosplat.volume import Volume
+from holosplat_bench.specimens.gas_waves import ExpandingShock
+from holosplat_bench.specimens.matter import CHANGING, Changing
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "data" / "changing.csv"
 PHOTONS = 3000.0

@@ -24,8 +24,8 @@ from scipy.special import fresnel
 import holosplat as hs
 from holosplat.beamline.simulate import Simulation, _Sharp
 from holosplat.model import measure
-from holosplat.specimens.drawn import box_mesh
 from holosplat.units import wavenumber
+from holosplat_bench.specimens.shapes import box_mesh
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "data" / "faces.csv"
 FINER = 4

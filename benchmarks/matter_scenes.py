@@ -42,10 +42,10 @@ from holosplat.metrics import dice, volume_scores
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens import MeshScene
 from holosplat.specimens.drawn import Drawn, Substances
-from holosplat.specimens.fluids import Cuvette
-from holosplat.specimens.matter import MATTER, Changing, FieldMatter
-from holosplat.specimens.solids import Channel
 from holosplat.volume import Volume, Wall
+from holosplat_bench.specimens.fluids import Cuvette
+from holosplat_bench.specimens.matter import MATTER, Changing, FieldMatter
+from holosplat_bench.specimens.solids import Channel
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "data" / "matter_scenes.csv"
 PIXEL, ENERGY, DISTANCE = 1e-6, 20.0, 0.1

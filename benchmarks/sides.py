@@ -27,7 +27,8 @@ from rows import machine, read, replaced, shown
 import holosplat as hs
 from holosplat.methods import Auto, Task, illumination
 from holosplat.methods.contrast import SPHERICAL, STAGE, decide_sides
-from holosplat.specimens import ExpandingShock, Substances
+from holosplat.specimens import Substances
+from holosplat_bench.specimens.gas_waves import ExpandingShock
 
 PAGE = Path(__file__).resolve().parents[1] / "docs/data/sides.csv"
 SHOCK = "shock in water"

@@ -14,6 +14,8 @@ from holosplat.methods import METHODS
 from holosplat.planning.needs import Estimated
 from holosplat.plugins import Extended
 from holosplat.representations import KINDS
+from holosplat.specimens.drawn import KINDS as SPECIMENS
+from holosplat.specimens.drawn import FieldKind
 from holosplat_bench.training.train import NETWORKS
 
 
@@ -55,6 +57,7 @@ def test_the_benchmark_adds_its_commands_methods_networks_and_kinds():
     assert set(methods) == {"neural-field", "onix", "pinn", "pixelnerf"}
     assert all(method.kind == name and isinstance(method, Estimated) for name, method in methods.items())
     assert set(NETWORKS) - set(NETWORKS.own) == {"onix", "pixelnerf"}
+    assert all(kind.kind == name and issubclass(kind, FieldKind) for name, kind in SPECIMENS.items())
     assert all(kind.kind == name and kind.__module__.startswith("holosplat_bench.") for name, kind in added.items())
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from tables.runs import script
 
 import holosplat as hs
-from holosplat.specimens.matter import MATTER
+from holosplat_bench.specimens.matter import MATTER
 
 IMAGES = Path(__file__).parents[1] / "images" / "matter"
 SEED, DPI, PHOTONS = 1, 72, 3000.0

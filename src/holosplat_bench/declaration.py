@@ -32,11 +32,12 @@ from holosplat.ranges import (
     checked_dataclass,
 )
 from holosplat.scan import Exposures, Scan
-from holosplat.specimens.drawn import Scene, Substances
-from holosplat.specimens.matter import ContinuousKind, Declarable, FieldMatter
+from holosplat.specimens.drawn import FieldKind, Substances, Truth
 from holosplat.specimens.phantoms import Ball
 from holosplat.specimens.scene import MeshScene
 from holosplat.volume import Volume
+
+from .specimens.matter import ContinuousKind, Declarable
 
 MOST_PIXELS = 4096
 
@@ -177,14 +178,14 @@ class Declaration:
             return MaterialPrior.known(contrast)
         return MaterialPrior.of_ratio(contrast.ratio) if self.prior == "ratio" else MaterialPrior.unknown()
 
-    def scene(self, seed: int, snapshots: Path | None) -> tuple[Scene, str, tuple[Ball, ...]]:
+    def scene(self, seed: int, snapshots: Path | None) -> tuple[Truth, str, tuple[Ball, ...]]:
         """The matter that `seed` gives, what it is in words, and the balls of a phantom of balls.
 
         The core of a mesh adds what it is filled with, less the material around it.
         """
         material, medium = self._delta_beta(self.matter.material), self._delta_beta(self.matter.medium)
         core = None if self.matter.core is None else self._delta_beta(self.matter.core)
-        if isinstance(self.specimen, FieldMatter):
+        if isinstance(self.specimen, FieldKind):
             found = self.specimen.drawn(Substances(material, core, medium), seed)
             return found.scene, found.text, ()
         if isinstance(self.specimen, ContinuousKind):
@@ -217,7 +218,7 @@ class Case:
 
     name: str
     seed: int
-    scene: Scene
+    scene: Truth
     exposures: Exposures
     is_test: np.ndarray
     prior: MaterialPrior

@@ -13,10 +13,10 @@ from holosplat.materials import DeltaBeta
 from holosplat.mesh import TriangleMesh
 from holosplat.model import measure
 from holosplat.scan import Exposures
-from holosplat.specimens.drawn import box_mesh
 from holosplat.specimens.red_cells import icosphere
 from holosplat.specimens.scene import MeshScene
 from holosplat.units import wavenumber
+from holosplat_bench.specimens.shapes import box_mesh
 
 DELTA = 1e-6
 

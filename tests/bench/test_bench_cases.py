@@ -17,9 +17,9 @@ from holosplat.matter import MaterialPrior
 from holosplat.scan import Exposures
 from holosplat.specimens.continuous import ContinuousScene
 from holosplat.specimens.phantoms import Ball
-from holosplat.specimens.rods import RodScene
 from holosplat.specimens.scene import MeshScene
 from holosplat.tables import merged
+from holosplat_bench.specimens.rods import RodScene
 from holosplat_bench.suite.case import FOLDER, Case, case_names, declared_names, load_case
 
 SLOW = ("crowded12",)

@@ -14,7 +14,7 @@ from holosplat.io.nxtomo import read_scan
 from holosplat.io.volumes import read_volume
 from holosplat.io.vtk import read_meshes
 from holosplat.materials import parse_material
-from holosplat.specimens.matter import CHANGING, MATTER
+from holosplat_bench.specimens.matter import CHANGING, MATTER
 
 FIELD: list[object] = ["--detector", 21, 30, "--pixel-size", "2e-6", "--views", 4]
 

@@ -10,7 +10,7 @@ from holosplat.materials import parse_material
 from holosplat.matter import DeltaBeta
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.drawn import Substances
-from holosplat.specimens.matter import MATTER
+from holosplat_bench.specimens.matter import MATTER
 
 PITCH, ENERGY = 1e-6, 20.0
 

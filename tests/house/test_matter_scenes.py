@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import holosplat as hs
-from holosplat.specimens.matter import MATTER
+from holosplat_bench.specimens.matter import MATTER
 
 ROOT = Path(__file__).resolve().parents[2]
 

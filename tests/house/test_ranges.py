@@ -21,7 +21,7 @@ from holosplat.checks import InputError
 from holosplat.cli.entry import COMMANDS, command
 from holosplat.materials import DeltaBeta
 from holosplat.ranges import _fields, hints_of, range_of, with_checked_numbers
-from holosplat.specimens.matter import CHANGING, MATTER
+from holosplat_bench.specimens.matter import CHANGING, MATTER
 
 ROOTS = [Path(package.__file__ or "").parent for package in (holosplat, holosplat_bench.suite)]
 INTERNAL = {"Group", "Choice", "_Best", "_Unread", "Mark", "Block", "Blocks", "Decision", "Fields"}

@@ -25,11 +25,12 @@ from holosplat.methods.trials import WITHOUT
 from holosplat.metrics import volume_scores
 from holosplat.optics.background import LightOptions
 from holosplat.scan import Exposures, Scan
-from holosplat.specimens import MeshScene, RodScene, Substances, random_bubbles
-from holosplat.specimens.matter import MATTER
+from holosplat.specimens import MeshScene, Substances
 from holosplat.specimens.red_cells import random_cells
 from holosplat.workflows.preconditions import decisions_of
 from holosplat.workflows.totals import TotalMatter
+from holosplat_bench.specimens.matter import MATTER
+from holosplat_bench.specimens.rods import RodScene, random_bubbles
 
 AIR_IN_WATER = DeltaBeta(-5.75e-7, -2.56e-10)
 PIXEL, SHAPE, VIEWS = 1e-6, (35, 42), 8

@@ -23,8 +23,9 @@ from holosplat.optics.background import LightOptions
 from holosplat.optics.noise import NoiseModel
 from holosplat.scan import Exposures, Scan
 from holosplat.series.plan import prior_of
-from holosplat.specimens import ExpandingShock, Substances
+from holosplat.specimens import Substances
 from holosplat.specimens.continuous import ContinuousScene, Soft, ellipsoid
+from holosplat_bench.specimens.gas_waves import ExpandingShock
 
 WATER = DeltaBeta(5.75e-7, 2.56e-10)
 PIXEL, SHAPE, PHOTONS = 1.4e-6, (33, 37), 3000.0

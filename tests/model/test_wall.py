@@ -17,8 +17,8 @@ from holosplat.materials import wall_of
 from holosplat.model import measure
 from holosplat.optics.retrieval import RETRIEVALS, tikhonov
 from holosplat.optics.sampling import fringe_sampling
-from holosplat.specimens.drawn import box_mesh, meshed
 from holosplat.volume import Wall, mean_wave
+from holosplat_bench.specimens.shapes import box_mesh, meshed
 
 PIXEL, SHAPE = 1e-6, (5, 45)
 GLASS, WATER = hs.DeltaBeta(1.2e-6, 3.6e-9), hs.DeltaBeta(5.8e-7, 2.6e-10)

@@ -17,9 +17,10 @@ from holosplat.methods import SmoothVolume
 from holosplat.optics.background import LightOptions
 from holosplat.scan import Exposures
 from holosplat.series.fronts import BEHIND, BETWEEN, FRONT_COLUMNS, PLACED, Front, front_rows
-from holosplat.specimens import ExpandingShock, Substances
+from holosplat.specimens import Substances
 from holosplat.volume import Volume
 from holosplat.workflows.totals import TotalMatter
+from holosplat_bench.specimens.gas_waves import ExpandingShock
 
 GRID = Grid.centred((31, 25, 37), 0.5e-6, (1e-6, 0.0, 0.0))
 DELTA = 4e-7

@@ -24,10 +24,11 @@ from holosplat.series import one_time
 from holosplat.series.folder import read_row
 from holosplat.series.one_time import Before, Shot, reconstruct_time
 from holosplat.series.plan import Settings
-from holosplat.specimens import ExpandingShock, Substances
+from holosplat.specimens import Substances
 from holosplat.specimens.phantoms import Ball
 from holosplat.workflows.reconstruct import load_reconstruction
 from holosplat.workflows.run_folder import RunFolder
+from holosplat_bench.specimens.gas_waves import ExpandingShock
 
 
 class Asked(Exception):

@@ -18,7 +18,8 @@ from holosplat.series.folder import DONE, Row, SeriesFolder
 from holosplat.series.one_time import common_totals
 from holosplat.series.plan import Cut, Settings, plan_series
 from holosplat.series.run import run_left
-from holosplat.specimens import ExpandingShock, Substances
+from holosplat.specimens import Substances
+from holosplat_bench.specimens.gas_waves import ExpandingShock
 
 
 def test_a_total_is_conserved_where_its_changes_are_within_their_errors():

@@ -34,10 +34,9 @@ from .specimen import NO_SPECTRUM, SourceOptions, SpecimenOptions
 if TYPE_CHECKING:
     from ..beamline.series import Timing
     from ..beamline.simulate import Filling
-    from ..specimens.drawn import Drawn
-    from ..specimens.scene import MeshScene, MeshSeries
+    from ..specimens.drawn import Drawn, Truth
+    from ..specimens.scene import MeshScene
     from ..volume import Object
-    from .specimen import Still
 
 
 @checked_dataclass
@@ -112,10 +111,10 @@ class _Specimen:
     """What is imaged at which times [T] of frames [s]; facts for the scan file; regions: named parts; goes_on: beyond
     the field."""
 
-    matter: Still | MeshSeries
+    matter: Truth
     times: np.ndarray
     facts: dict[str, str]
-    regions: Mapping[str, Still] = field(default_factory=dict)
+    regions: Mapping[str, Truth] = field(default_factory=dict)
     goes_on: bool = False
 
 
@@ -253,7 +252,7 @@ def _facts(scene: MeshScene) -> dict[str, str]:
 
 
 def _still(
-    generated: Still | Drawn,
+    generated: Truth | Drawn,
     times: np.ndarray,
     imaged: SpecimenOptions,
     files: tuple[Path, ...],

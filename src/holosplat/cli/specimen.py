@@ -23,14 +23,8 @@ if TYPE_CHECKING:
     from ..scan import Exposures
     from ..specimens.carried import CarriedScene
     from ..specimens.continuous import ContinuousScene
-    from ..specimens.drawn import ChangingScene, Drawn
-    from ..specimens.matter import Changing as ChangingMatter
-    from ..specimens.matter import FieldMatter
-    from ..specimens.rods import RodScene
-    from ..specimens.scene import MeshScene, MeshSeries, VoxelScene
-
-    Still = MeshScene | ContinuousScene | VoxelScene | CarriedScene | RodScene | ChangingScene
-    AnyMatter = FieldMatter | ChangingMatter
+    from ..specimens.drawn import Drawn, FieldKind, Truth
+    from ..specimens.scene import VoxelScene
 
 NO_SPECTRUM = (
     "a spectrum needs meshes of files, whose materials are known at every energy; leave --bandwidth and --spectrum out."
@@ -86,9 +80,7 @@ class SourceOptions:
             )
         return beamline
 
-    def frames(
-        self, matter: Still | MeshSeries, filling: Filling, exposures: Exposures, how: Simulation
-    ) -> Iterator[np.ndarray]:
+    def frames(self, matter: Truth, filling: Filling, exposures: Exposures, how: Simulation) -> Iterator[np.ndarray]:
         """Frames [H, W] of `matter`, one after another."""
         from ..beamline.simulate import polychromatic_frames, refilled, simulated_frames
         from ..specimens.scene import MeshScene, MeshSeries
@@ -118,25 +110,7 @@ class SourceOptions:
 
 Moving = Literal["stirred-blob", "collapsing-foam"]
 Soft = Literal["soft-cells", "round-cell", "tissue", "head-phantom", "coated-droplets", "body-with-absorber"]
-InField = Literal[
-    "bubbles",
-    "flotation",
-    "cuvette",
-    "jet",
-    "break-up",
-    "crack",
-    "shock",
-    "keyhole",
-    "lattice",
-    "fibres",
-    "channel",
-    "star",
-]
-"""The kinds of `specimens.MATTER`."""
-Changing = Literal["merging-drops", "collapse", "pinching-jet", "expanding-shock", "crushed-lattice"]
-"""The kinds of `specimens.CHANGING`."""
-CARRIED: tuple[Moving, ...] = ("stirred-blob", "collapsing-foam")
-MOVING: tuple[Moving | Changing, ...] = (*CARRIED, *get_args(Changing))
+CARRIED: tuple[Moving, ...] = get_args(Moving)
 CORED = ("coated-droplets", "body-with-absorber")
 USUAL_COUNT = 9
 """Cells or droplets unless --specimen-count says otherwise."""
@@ -179,8 +153,8 @@ class VolumeOptions:
 class GeneratedOptions:
     """Matter that is generated, in place of files."""
 
-    specimen: Soft | Moving | Changing | InField | None = None
-    """Kind of specimen (docs/simulation.md)."""
+    specimen: str | None = None
+    """Kind of specimen: soft-cells, tissue, bubbles, jet, lattice … (docs/simulation.md has all)."""
     specimen_size: Small | None = None
     """Its extent [m] (default: 0.85 of the shorter side of the field of view, or as its kind has it)."""
     specimen_count: Many | None = None
@@ -206,7 +180,8 @@ class GeneratedOptions:
     def timing(self, motion: MotionOptions) -> np.ndarray:
         """The times [T] of the frames [s], the first at 0; `InputError` where `motion` and the specimen do not fit."""
         timing = motion.timing()
-        if self.specimen not in MOVING:
+        kind = self._kind()
+        if self.specimen not in CARRIED and not (kind is not None and kind.changes):
             require(timing is None, "--frame-rate is of moving meshes, or of a specimen that moves; leave it out.")
             return np.zeros(1)
         if timing is None or timing.frames is None or timing.frames < 2:
@@ -223,7 +198,7 @@ class GeneratedOptions:
         material, _, medium = kind.named
         return replace(filling, material=filling.material or material, medium=filling.medium or medium)
 
-    def in_field(self, beamline: BeamlineOptions) -> AnyMatter | None:
+    def in_field(self, beamline: BeamlineOptions) -> FieldKind | None:
         """The matter that may fill the field, with its parameters; None for other specimens."""
         kind = self._kind()
         require(
@@ -283,11 +258,16 @@ class GeneratedOptions:
         inside = None if core is None else parse_material(core, self.core_density).delta_beta(energy)
         return found.drawn(Substances(material, inside, medium), self.specimen_seed)
 
-    def _kind(self) -> type[AnyMatter] | None:
-        from ..specimens.matter import CHANGING, MATTER
+    def _kind(self) -> type[FieldKind] | None:
+        """The kind that may fill the field; None for others. Errors: `InputError` for a name that is none."""
+        from ..specimens.drawn import KINDS
 
-        kinds: dict[str, type[AnyMatter]] = {**MATTER, **CHANGING}
-        return None if self.specimen is None else kinds.get(self.specimen)
+        own = (*get_args(Soft), *CARRIED)
+        if self.specimen is None or self.specimen in own:
+            return None
+        known = f"--specimen must be one of {', '.join((*own, *KINDS))}, but it is {self.specimen!r}."
+        require(self.specimen in KINDS, known)
+        return KINDS[self.specimen]
 
     def scene(
         self, beamline: BeamlineOptions, filling: Filling, duration: float = 0.0

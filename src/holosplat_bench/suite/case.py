@@ -22,7 +22,13 @@ from holosplat.matter import DeltaBeta
 from holosplat.ranges import Many, ManyOrNone, Metres, Small, checked_dataclass
 from holosplat.scan import Exposures, interleaved_split
 from holosplat.specimens.continuous import ContinuousScene
-from holosplat.specimens.matter import (
+from holosplat.specimens.phantoms import star_of_balls
+from holosplat.specimens.repair import closed
+from holosplat.specimens.soft_matter import body_with_absorber, coated_droplets, round_cell, shepp_logan, tissue
+from holosplat.tables import from_table, merged, read_table
+
+from ..declaration import Case, Declaration, Listed, case_of
+from ..specimens.matter import (
     Bodies,
     Capsules,
     ContinuousKind,
@@ -34,12 +40,6 @@ from holosplat.specimens.matter import (
     RedCells,
     SoftCells,
 )
-from holosplat.specimens.phantoms import star_of_balls
-from holosplat.specimens.repair import closed
-from holosplat.specimens.soft_matter import body_with_absorber, coated_droplets, round_cell, shepp_logan, tissue
-from holosplat.tables import from_table, merged, read_table
-
-from ..declaration import Case, Declaration, Listed, case_of
 
 
 @checked_dataclass

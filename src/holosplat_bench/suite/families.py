@@ -17,7 +17,12 @@ from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.metrics import volume_scores
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.continuous import Bump, ContinuousScene, Element, Soft, ellipsoid
-from holosplat.specimens.matter import (
+from holosplat.specimens.phantoms import packed_balls
+from holosplat.specimens.scene import MeshScene
+from holosplat.units import wavelength, wavenumber
+from holosplat.workflows.reconstruct import Reconstruction
+
+from ..specimens.matter import (
     Capsules,
     ContinuousKind,
     CrowdedCells,
@@ -26,11 +31,6 @@ from holosplat.specimens.matter import (
     RedCells,
     SoftCells,
 )
-from holosplat.specimens.phantoms import packed_balls
-from holosplat.specimens.scene import MeshScene
-from holosplat.units import wavelength, wavenumber
-from holosplat.workflows.reconstruct import Reconstruction
-
 from .case import BallStar, BodyWithAbsorber, CoatedDroplets, RoundCell, SheppLogan, Specimen, Tissue
 
 

@@ -26,14 +26,15 @@ from holosplat.io.volumes import read_volume, write_volume
 from holosplat.matter import KnownRatio
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.continuous import ContinuousScene
-from holosplat.specimens.drawn import ChangingScene, Scene, Still
-from holosplat.specimens.rods import RodScene
+from holosplat.specimens.drawn import ChangingScene, Truth
+from holosplat.specimens.scene import MeshScene
 from holosplat.units import wavenumber
 from holosplat.volume import Volume
 from holosplat.workflows.correct import CorrectionOptions, correct
 from holosplat.workflows.provenance import scan_hash
 
 from ..declaration import Case
+from ..specimens.rods import RodScene
 
 DARKEST = 1e-3
 """Relative intensity below which a pixel counts as so bright: its logarithm has no meaning."""
@@ -197,17 +198,18 @@ def fingerprint(case: Case) -> str:
     return digest.hexdigest()[:16]
 
 
-def _stills(scene: Scene) -> list[Still]:
+def _stills(scene: Truth) -> list[Truth]:
     """A scene, or one that changes at its first, middle and last time."""
     return [scene.drawn(share) for share in (0.0, 0.5, 1.0)] if isinstance(scene, ChangingScene) else [scene]
 
 
-def _matter(scene: Still) -> list[object]:
+def _matter(scene: Truth) -> list[object]:
     """δ and β of each body, and the profiles of continuous ones."""
     if isinstance(scene, ContinuousScene):
         return [(element.profile, tuple(element.matter)) for element in scene.elements]
     if isinstance(scene, RodScene):
         return [tuple(scene.matter)]
+    assert isinstance(scene, MeshScene)
     return [tuple(material) for material in scene.materials]
 
 
@@ -218,7 +220,7 @@ def _arrays(case: Case) -> Iterable[np.ndarray]:
                 yield from (element.centre, element.axes, element.gradient)
         elif isinstance(scene, RodScene):
             yield from (scene.ends, scene.radii)
-        else:
+        elif isinstance(scene, MeshScene):
             for mesh in scene.meshes:
                 yield from (mesh.vertices, mesh.faces)
     exposures = case.exposures

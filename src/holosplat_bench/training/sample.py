@@ -18,13 +18,13 @@ from holosplat.learning.start import retrieved_thickness
 from holosplat.matter import DeltaBeta
 from holosplat.optics.noise import noise_levels
 from holosplat.scan import Exposures, Scan
-from holosplat.specimens.matter import Capsules, CrowdedCells, Declarable, FoamDrop, RedCells, SoftCells
 from holosplat.specimens.red_cells import DIAMETER, evans_fung_cell
 from holosplat.specimens.scene import MeshScene
 from holosplat.units import wavelength
 from holosplat.volume import Volume
 
 from ..declaration import Beam, Case, Declaration, Detector, Listed, Matter, Substance, case_of
+from ..specimens.matter import Capsules, CrowdedCells, Declarable, FoamDrop, RedCells, SoftCells
 from .options import Kind, Ranges
 
 PURPOSE = 2101

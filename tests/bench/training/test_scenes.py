@@ -12,8 +12,8 @@ from holosplat.checks import InputError
 from holosplat.learning.network import FINE, coarse, thickness_of
 from holosplat.materials import DeltaBeta
 from holosplat.specimens.drawn import Substances
-from holosplat.specimens.fluids import Bubbles
 from holosplat_bench.declaration import Matter, Substance, case_of
+from holosplat_bench.specimens.fluids import Bubbles
 from holosplat_bench.training.folder import Dataset, write_datasheet
 from holosplat_bench.training.options import Ranges
 from holosplat_bench.training.sample import Sample, draw_scene, sample_of

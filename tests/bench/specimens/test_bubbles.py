@@ -13,7 +13,8 @@ from holosplat.geometry import Grid, Views
 from holosplat.materials import WATER, DeltaBeta, parse_material
 from holosplat.model import measure
 from holosplat.scan import Exposures
-from holosplat.specimens import Ball, RodScene, random_bubbles
+from holosplat.specimens import Ball
+from holosplat_bench.specimens.rods import RodScene, random_bubbles
 
 PIXEL = 1e-6
 AIR_IN_WATER = parse_material("air").delta_beta(20.0).against(WATER.delta_beta(20.0))

@@ -14,21 +14,19 @@ from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta
 from holosplat.mesh import TriangleMesh
 from holosplat.scan import Exposures
-from holosplat.specimens import (
+from holosplat.specimens import ContinuousScene, Drawn, MeshScene, Substances
+from holosplat_bench.specimens.changing import (
+    RAYLEIGH,
     Collapse,
-    ContinuousScene,
     CrushedLattice,
-    Drawn,
-    ExpandingShock,
     MergingDrops,
-    MeshScene,
     PinchingJet,
-    RodScene,
-    Substances,
+    bubble_radius,
+    growth_rate,
 )
-from holosplat.specimens.changing import RAYLEIGH, bubble_radius, growth_rate
-from holosplat.specimens.fluids import FASTEST
-from holosplat.specimens.gas_waves import Fluid, Radial, waves
+from holosplat_bench.specimens.fluids import FASTEST
+from holosplat_bench.specimens.gas_waves import ExpandingShock, Fluid, Radial, waves
+from holosplat_bench.specimens.rods import RodScene
 
 SIZE = 40e-6
 WATER = DeltaBeta(5e-7, 2e-10)

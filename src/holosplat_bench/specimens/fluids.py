@@ -10,13 +10,15 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..checks import InputError, require
-from ..mesh import TriangleMesh
-from ..ranges import Many, ManyOrNone, Share, Small, SomeShare, checked_dataclass
-from .continuous import NODES, WEIGHTS, ContinuousScene, Soft, ellipsoid
-from .drawn import LONG, SHARE, Drawn, SpecimenKind, Substances, ball_meshes, column, lathe, meshed, region
-from .phantoms import Ball
+from holosplat.checks import InputError, require
+from holosplat.mesh import TriangleMesh
+from holosplat.ranges import Many, ManyOrNone, Share, Small, SomeShare, checked_dataclass
+from holosplat.specimens.continuous import NODES, WEIGHTS, ContinuousScene, Soft, ellipsoid
+from holosplat.specimens.drawn import Drawn, FieldKind, Substances
+from holosplat.specimens.phantoms import Ball
+
 from .rods import RodScene, random_bubbles
+from .shapes import LONG, SHARE, ball_meshes, column, lathe, meshed, region
 
 PIECES = 8
 """Pieces of a ray that are integrated one by one: with a tail of a twentieth, right to 1e-6 of the largest integral."""
@@ -80,12 +82,12 @@ TRIES = 10_000
 
 
 @checked_dataclass
-class Bubbles(SpecimenKind):
+class Bubbles(FieldKind):
     """Gas bubbles in a medium that fills the field and goes on beyond it."""
 
     kind: ClassVar[str] = "bubbles"
     goes_on: ClassVar[bool] = True
-    named: ClassVar = ("air", None, "water")
+    named: ClassVar[tuple[str, str | None, str | None]] = ("air", None, "water")
     extent: ClassVar[float] = 0.85
     size: Small
     """Diameter and height of the cylinder about the rotation axis in which they lie [m]."""
@@ -105,13 +107,13 @@ class Bubbles(SpecimenKind):
 
 
 @checked_dataclass
-class Flotation(SpecimenKind):
+class Flotation(FieldKind):
     """Gas bubbles and solid beads, the core, in a liquid that fills the field and goes on beyond it."""
 
     kind: ClassVar[str] = "flotation"
     has_core: ClassVar[bool] = True
     goes_on: ClassVar[bool] = True
-    named: ClassVar = ("air", "glass", "water")
+    named: ClassVar[tuple[str, str | None, str | None]] = ("air", "glass", "water")
     extent: ClassVar[float] = 0.85
     size: Small
     """Diameter and height of the cylinder about the rotation axis in which they lie [m]."""
@@ -135,7 +137,7 @@ class Flotation(SpecimenKind):
 
 
 @checked_dataclass
-class Cuvette(SpecimenKind):
+class Cuvette(FieldKind):
     """A square tube about the rotation axis, which goes on above and below: its wall, a liquid, bubbles in that.
 
     The material is the wall's, the core is the liquid, and bubbles hold what is around the tube.
@@ -144,7 +146,7 @@ class Cuvette(SpecimenKind):
     kind: ClassVar[str] = "cuvette"
     has_core: ClassVar[bool] = True
     goes_on: ClassVar[bool] = True
-    named: ClassVar = ("glass", "water", None)
+    named: ClassVar[tuple[str, str | None, str | None]] = ("glass", "water", None)
     extent: ClassVar[float] = 0.6
     size: Small
     """Outer width [m]."""
@@ -168,7 +170,7 @@ class Cuvette(SpecimenKind):
 
 
 @checked_dataclass
-class Jet(SpecimenKind):
+class Jet(FieldKind):
     """A liquid jet along the rotation axis, which swells and narrows as Rayleigh's disturbance makes it, with bubbles.
 
     It goes on above and below. Bubbles hold what is around the jet.
@@ -176,7 +178,7 @@ class Jet(SpecimenKind):
 
     kind: ClassVar[str] = "jet"
     goes_on: ClassVar[bool] = True
-    named: ClassVar = ("water", None, None)
+    named: ClassVar[tuple[str, str | None, str | None]] = ("water", None, None)
     extent: ClassVar[float] = 0.45
     size: Small
     """Diameter of the undisturbed jet [m]."""
@@ -206,7 +208,7 @@ class Jet(SpecimenKind):
 
 
 @checked_dataclass
-class BreakUp(SpecimenKind):
+class BreakUp(FieldKind):
     """Threads of liquid along the rotation axis that broke up into drops, satellites and ligaments.
 
     A thread of radius a breaks at `waves` wavelengths of λ = 9.02 a. Each wave's volume π a² λ becomes a drop,
@@ -214,7 +216,7 @@ class BreakUp(SpecimenKind):
     """
 
     kind: ClassVar[str] = "break-up"
-    named: ClassVar = ("water", None, None)
+    named: ClassVar[tuple[str, str | None, str | None]] = ("water", None, None)
     extent: ClassVar[float] = 0.82
     size: Small
     """Height and diameter of the spray [m]."""
@@ -284,7 +286,7 @@ class BreakUp(SpecimenKind):
 
 
 @checked_dataclass
-class Shock(SpecimenKind):
+class Shock(FieldKind):
     """A decaying spherical shock in a medium that fills the field: a jump, compression, rarefaction, and its bubble.
 
     δ and β of the medium rise by `jump` at the front (`specimens.fluids`); the material fills the bubble in its middle.
@@ -292,7 +294,7 @@ class Shock(SpecimenKind):
 
     kind: ClassVar[str] = "shock"
     goes_on: ClassVar[bool] = True
-    named: ClassVar = ("air", None, "water")
+    named: ClassVar[tuple[str, str | None, str | None]] = ("air", None, "water")
     extent: ClassVar[float] = 0.8
     size: Small
     """Diameter of the front [m]."""

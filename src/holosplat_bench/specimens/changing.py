@@ -15,16 +15,18 @@ from scipy.integrate import OdeSolution, solve_ivp
 from scipy.optimize import root_scalar
 from scipy.special import iv, logsumexp
 
-from ..checks import require
-from ..matter import DeltaBeta
-from ..mesh import TriangleMesh
-from ..ranges import Positive, Share, Small, SomeShare, checked_dataclass
-from .continuous import random_direction, random_rotation
-from .drawn import LONG, SHARE, ChangingScene, Drawn, SpecimenKind, Substances, lathe, meshed, region
+from holosplat.checks import require
+from holosplat.matter import DeltaBeta
+from holosplat.mesh import TriangleMesh
+from holosplat.ranges import Positive, Share, Small, SomeShare, checked_dataclass
+from holosplat.specimens.continuous import random_direction, random_rotation
+from holosplat.specimens.drawn import ChangingScene, Drawn, FieldKind, Substances
+from holosplat.specimens.phantoms import Ball, unit_ball
+from holosplat.specimens.scene import MeshScene
+
 from .fluids import FASTEST
-from .phantoms import Ball, unit_ball
 from .rods import Rod, RodScene
-from .scene import MeshScene
+from .shapes import LONG, SHARE, lathe, meshed, region
 from .solids import Lattice
 
 ROWS = 193
@@ -32,7 +34,7 @@ ROWS = 193
 
 
 @checked_dataclass
-class MergingDrops(SpecimenKind):
+class MergingDrops(FieldKind):
     """Two drops that approach, touch, and flow together into one ball, their volume and their centre kept.
 
     From contact on the surface is `Σ exp(-(|x - cᵢ| - Rᵢ)/k) = 1`, grown to the volume of both: k grows evenly, and so
@@ -40,7 +42,8 @@ class MergingDrops(SpecimenKind):
     """
 
     kind: ClassVar[str] = "merging-drops"
-    named: ClassVar = ("water", None, None)
+    changes: ClassVar[bool] = True
+    named: ClassVar[tuple[str, str | None, str | None]] = ("water", None, None)
     extent: ClassVar[float] = 0.8
     size: Small
     """Length of both drops with their gap at the first time [m]."""
@@ -126,14 +129,15 @@ def bubble_radius(gas: float, mach: float, until: float, least: float = 1e-3) ->
 
 
 @checked_dataclass
-class Collapse(SpecimenKind):
+class Collapse(FieldKind):
     """A bubble in a liquid jet along the rotation axis that collapses, pierced by a jet of its own from one side.
 
     Its volume is that of Keller & Miksis' bubble. The liquid keeps its volume: the jet bulges where the bubble is.
     """
 
     kind: ClassVar[str] = "collapse"
-    named: ClassVar = ("water", None, None)
+    changes: ClassVar[bool] = True
+    named: ClassVar[tuple[str, str | None, str | None]] = ("water", None, None)
     goes_on: ClassVar[bool] = True
     extent: ClassVar[float] = 0.55
     size: Small
@@ -197,7 +201,7 @@ def growth_rate(wave_number: float) -> float:
 
 
 @checked_dataclass
-class PinchingJet(SpecimenKind):
+class PinchingJet(FieldKind):
     """A jet along the rotation axis that Rayleigh and Plateau's disturbance breaks into drops, its volume kept.
 
     The fastest wave grows from rest as `cosh ωt` until its necks close; each wave's liquid then draws together into a
@@ -205,7 +209,8 @@ class PinchingJet(SpecimenKind):
     """
 
     kind: ClassVar[str] = "pinching-jet"
-    named: ClassVar = ("water", None, None)
+    changes: ClassVar[bool] = True
+    named: ClassVar[tuple[str, str | None, str | None]] = ("water", None, None)
     goes_on: ClassVar[bool] = True
     extent: ClassVar[float] = 0.16
     size: Small
@@ -260,6 +265,7 @@ class CrushedLattice(Lattice):
     volume."""
 
     kind: ClassVar[str] = "crushed-lattice"
+    changes: ClassVar[bool] = True
     strain: SomeShare = 0.25
     """Share of its height that it loses over the course."""
     bulge: Share = 0.2

@@ -12,27 +12,11 @@ from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta
 from holosplat.scan import Exposures
-from holosplat.specimens import (
-    BreakUp,
-    Bubbles,
-    Channel,
-    ContinuousScene,
-    Crack,
-    Cuvette,
-    Drawn,
-    Fibres,
-    Flotation,
-    Jet,
-    Keyhole,
-    Lattice,
-    MeshScene,
-    RodScene,
-    Shock,
-    Star,
-    Substances,
-)
-from holosplat.specimens.fluids import FASTEST
-from holosplat.specimens.matter import CHANGING, MATTER
+from holosplat.specimens import ContinuousScene, Drawn, MeshScene, Substances
+from holosplat_bench.specimens.fluids import FASTEST, BreakUp, Bubbles, Cuvette, Flotation, Jet, Shock
+from holosplat_bench.specimens.matter import CHANGING, MATTER
+from holosplat_bench.specimens.rods import RodScene
+from holosplat_bench.specimens.solids import Channel, Crack, Fibres, Keyhole, Lattice, Star
 
 KINDS = {**MATTER, **CHANGING}
 PIXEL = 1e-6

@@ -8,17 +8,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal, get_args
 
-from ..matter import DeltaBeta
-from ..mesh import TriangleMesh
-from ..ranges import Many, Seed, Share, Small, SomeShare, checked_dataclass
+from holosplat.matter import DeltaBeta
+from holosplat.mesh import TriangleMesh
+from holosplat.ranges import Many, Seed, Share, Small, SomeShare, checked_dataclass
+from holosplat.specimens.continuous import ContinuousScene
+from holosplat.specimens.drawn import SpecimenKind
+from holosplat.specimens.phantoms import Ball, place_capsules, random_foam
+from holosplat.specimens.red_cells import crowded_cells, random_cells
+from holosplat.specimens.soft_matter import soft_cells
+
 from .changing import Collapse, CrushedLattice, MergingDrops, PinchingJet
-from .continuous import ContinuousScene
-from .drawn import SpecimenKind
 from .fluids import BreakUp, Bubbles, Cuvette, Flotation, Jet, Shock
 from .gas_waves import ExpandingShock
-from .phantoms import Ball, place_capsules, random_foam
-from .red_cells import crowded_cells, random_cells
-from .soft_matter import soft_cells
 from .solids import Channel, Crack, Fibres, Keyhole, Lattice, Star
 
 FieldMatter = (

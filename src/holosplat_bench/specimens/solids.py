@@ -9,25 +9,13 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..checks import require
-from ..ranges import Many, ManyOrNone, Share, Small, SomeShare, checked_dataclass
-from .drawn import (
-    LONG,
-    SHARE,
-    Drawn,
-    SpecimenKind,
-    Substances,
-    ball_meshes,
-    box_mesh,
-    column,
-    lathe,
-    meshed,
-    prism,
-    region,
-    rough_lens,
-)
-from .red_cells import random_cells
+from holosplat.checks import require
+from holosplat.ranges import Many, ManyOrNone, Share, Small, SomeShare, checked_dataclass
+from holosplat.specimens.drawn import Drawn, FieldKind, Substances
+from holosplat.specimens.red_cells import random_cells
+
 from .rods import Rod, RodScene
+from .shapes import LONG, SHARE, ball_meshes, box_mesh, column, lathe, meshed, prism, region, rough_lens
 
 HURST = 0.8
 """Exponent of the roughness of fracture surfaces (Bouchaud 1997, J. Phys. Condens. Matter 9, 4319)."""
@@ -36,12 +24,12 @@ MODES = 60
 
 
 @checked_dataclass
-class Crack(SpecimenKind):
+class Crack(FieldKind):
     """A penny-shaped crack with rough faces in a block that is larger than the field."""
 
     kind: ClassVar[str] = "crack"
     goes_on: ClassVar[bool] = True
-    named: ClassVar = ("air", None, "PMMA")
+    named: ClassVar[tuple[str, str | None, str | None]] = ("air", None, "PMMA")
     extent: ClassVar[float] = 0.8
     size: Small
     """Diameter of the crack [m]."""
@@ -72,7 +60,7 @@ class Crack(SpecimenKind):
 
 
 @checked_dataclass
-class Keyhole(SpecimenKind):
+class Keyhole(FieldKind):
     """The vapour cavity of a laser weld in a square bar, which goes on below, with pores behind it.
 
     The beam comes from above (-y). Cavity and pores hold what is around the bar.
@@ -80,7 +68,7 @@ class Keyhole(SpecimenKind):
 
     kind: ClassVar[str] = "keyhole"
     goes_on: ClassVar[bool] = True
-    named: ClassVar = ("titanium", None, None)
+    named: ClassVar[tuple[str, str | None, str | None]] = ("titanium", None, None)
     extent: ClassVar[float] = 0.6
     size: Small
     """Width of the bar [m]."""
@@ -120,11 +108,11 @@ class Keyhole(SpecimenKind):
 
 
 @checked_dataclass
-class Lattice(SpecimenKind):
+class Lattice(FieldKind):
     """A cube of body-centred cubic unit cells, whose struts lead from the corners to the middle of each."""
 
     kind: ClassVar[str] = "lattice"
-    named: ClassVar = ("PMMA", None, None)
+    named: ClassVar[tuple[str, str | None, str | None]] = ("PMMA", None, None)
     extent: ClassVar[float] = 0.6
     size: Small
     """Edge of the cube [m]."""
@@ -152,12 +140,12 @@ class Lattice(SpecimenKind):
 
 
 @checked_dataclass
-class Fibres(SpecimenKind):
+class Fibres(FieldKind):
     """Thin straight fibres about the direction of the rotation axis, which go on above and below."""
 
     kind: ClassVar[str] = "fibres"
     goes_on: ClassVar[bool] = True
-    named: ClassVar = ("nylon", None, None)
+    named: ClassVar[tuple[str, str | None, str | None]] = ("nylon", None, None)
     extent: ClassVar[float] = 0.85
     size: Small
     """Diameter of the cylinder through whose middle plane they go [m]."""
@@ -182,7 +170,7 @@ class Fibres(SpecimenKind):
 
 
 @checked_dataclass
-class Channel(SpecimenKind):
+class Channel(FieldKind):
     """A channel along the rotation axis in a block that is larger than the field: three materials.
 
     The medium is the block's, the material is the liquid in the channel, and the core that of the red cells in it.
@@ -191,7 +179,7 @@ class Channel(SpecimenKind):
     kind: ClassVar[str] = "channel"
     has_core: ClassVar[bool] = True
     goes_on: ClassVar[bool] = True
-    named: ClassVar = ("plasma", "red cell", "glass")
+    named: ClassVar[tuple[str, str | None, str | None]] = ("plasma", "red cell", "glass")
     extent: ClassVar[float] = 0.65
     size: Small
     """Width of the channel along x [m]."""
@@ -214,14 +202,14 @@ class Channel(SpecimenKind):
 
 
 @checked_dataclass
-class Star(SpecimenKind):
+class Star(FieldKind):
     """A Siemens star in a plane that holds the rotation axis: wedges with gaps as wide, which shows the resolution.
 
     Along the axis and across it the period at the radius r is 2π r / `spokes`.
     """
 
     kind: ClassVar[str] = "star"
-    named: ClassVar = ("PMMA", None, None)
+    named: ClassVar[tuple[str, str | None, str | None]] = ("PMMA", None, None)
     extent: ClassVar[float] = 0.85
     size: Small
     """Diameter [m]."""

@@ -9,10 +9,12 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..checks import require
-from ..ranges import Positive, Share, Small, SomeShare, checked_dataclass
-from .continuous import ContinuousScene, Soft, ellipsoid, random_direction
-from .drawn import SHARE, ChangingScene, Drawn, SpecimenKind, Substances
+from holosplat.checks import require
+from holosplat.ranges import Positive, Share, Small, SomeShare, checked_dataclass
+from holosplat.specimens.continuous import ContinuousScene, Soft, ellipsoid, random_direction
+from holosplat.specimens.drawn import ChangingScene, Drawn, FieldKind, Substances
+
+from .shapes import SHARE
 
 COURANT = 0.4
 """Part of a cell that the fastest wave crosses in a step; the scheme is stable up to a half."""
@@ -109,7 +111,7 @@ WATER = Fluid(4.4, 1 / 4.4)
 
 
 @checked_dataclass
-class ExpandingShock(SpecimenKind):
+class ExpandingShock(FieldKind):
     """A spherical shock in a medium that fills the field, from a core that is suddenly hot, as by a laser's focus.
 
     Euler's equations of a stiffened gas, whose waves are those of water: the front, what it compresses, and the
@@ -117,8 +119,9 @@ class ExpandingShock(SpecimenKind):
     """
 
     kind: ClassVar[str] = "expanding-shock"
+    changes: ClassVar[bool] = True
     goes_on: ClassVar[bool] = True
-    named: ClassVar = ("water", None, "water")
+    named: ClassVar[tuple[str, str | None, str | None]] = ("water", None, "water")
     extent: ClassVar[float] = 0.85
     size: Small
     """Diameter of the front at the last time [m]."""

@@ -9,7 +9,8 @@ from scipy.integrate import quad
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta
-from holosplat.specimens import Blast, ContinuousScene, ellipsoid
+from holosplat.specimens import ContinuousScene, ellipsoid
+from holosplat_bench.specimens.fluids import Blast
 
 TAILS = [0.05, 0.15, 1.0]
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from holosplat.mesh import TriangleMesh
-from holosplat.specimens.drawn import box_mesh, column, lathe, prism, rough_lens
+from holosplat_bench.specimens.shapes import box_mesh, column, lathe, prism, rough_lens
 
 HEIGHTS = np.array([-3e-6, 1e-6, 2e-6])
 MODES = np.array([[3e5, 1e5, 0.3, 2e-6], [-1e5, 4e5, 1.0, 1e-6]])

@@ -8,7 +8,7 @@ import pytest
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta
-from holosplat.specimens import Rod, RodScene
+from holosplat_bench.specimens.rods import Rod, RodScene
 
 PIXEL = 1e-6
 MATTER = DeltaBeta(6e-7, 3e-10)

@@ -11,13 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from ..checks import finite, in_range, require, shaped
-from ..frames import block_means
-from ..geometry import Grid, Views
-from ..matter import DeltaBeta
-from ..volume import LineIntegrals, Unmoved, Volume
-from .continuous import PER_VOXEL, RAYS
-from .phantoms import Ball, packed_balls
+from holosplat.checks import finite, in_range, require, shaped
+from holosplat.frames import block_means
+from holosplat.geometry import Grid, Views
+from holosplat.matter import DeltaBeta
+from holosplat.specimens.continuous import PER_VOXEL, RAYS
+from holosplat.specimens.phantoms import Ball, packed_balls
+from holosplat.volume import LineIntegrals, Unmoved, Volume
 
 Box = tuple[float, float, float]
 TILE = 32

@@ -1,0 +1,1 @@
+"""Matter that is generated for simulated scenes: of fluids, solids, soft bodies and meshes, still or changing."""
