@@ -44,13 +44,13 @@ from holosplat.motion.elastic import Rest
 from holosplat.motion.forecast import Forecaster, Halves, History, PathForecast, early_count
 from holosplat.motion.learned import GraphForecast
 from holosplat.motion.measures import half_sets
-from holosplat.motion.modes import DmdForecast, SindyForecast
 from holosplat.motion.track import TrackOptions, follow
 from holosplat.representations import MovingSurfaces
 from holosplat.representations.flow import TimeBasis
 from holosplat.specimens.membrane.model import Elasticity
 from holosplat.specimens.scene import MeshSeries
 from holosplat.workflows.evaluate import render_object
+from holosplat_bench.opponents.modes import DmdForecast, SindyForecast
 from motion import ANGLES, BODY, MATERIAL, PIXEL, SHAPE, cells_in_flow, imaged
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "data" / "forecast.csv"

@@ -15,9 +15,8 @@ from ..io.reading import Reading, Told, ends_of
 from ..motion.cell_model import ChannelFrame
 from ..motion.dynamics import DynamicsForecast
 from ..motion.fit import MotionFit
-from ..motion.forecast import SAME_TIME, PathForecast
+from ..motion.forecast import FORECASTERS, SAME_TIME, Forecaster, PathForecast
 from ..motion.learned import GraphForecast
-from ..motion.modes import DmdForecast, SindyForecast
 from ..planning.acts import of_forecast
 from ..ranges import Many, Positive, Seconds, Seed, Signed, Small, checked_dataclass
 from ..report.run import report_run
@@ -45,6 +44,8 @@ from .places import Output
 from .progress import ProgressBar
 from .sentence import interruptible, put, say, tell
 
+OWN = ("auto", "paths", "rigid", "mechanics", "assimilate", "graph", "hybrid")
+"""Ways of --by; other packages add theirs."""
 MECHANICAL = ("auto", "mechanics", "hybrid", "assimilate")
 OF_CHANNEL = ("flow_axis", "channel_centre", "peak", "shear_modulus", "viscosity", "back")
 """Options of the mechanics, beside the channel."""
@@ -60,7 +61,7 @@ class ForecastFlags:
     """Times ahead."""
     step: Seconds | None = None
     """Between them [s] (default: the median step of the run)."""
-    by: Literal["auto", "paths", "rigid", "mechanics", "assimilate", "graph", "hybrid", "dmd", "sindy"] = "auto"
+    by: str = "auto"
     """Paths go on, each part of the motion as far as frames tell it; rigid: shapes stay; mechanics: red cells in the
     flow of --channel, which their paths over the last times tell; assimilate: the same, fitted to the frames of these
     times (4D-Var); graph: a network that learnt from red cells in flow; hybrid: the mean of mechanics and the network
@@ -96,7 +97,8 @@ class ForecastFlags:
 
     def options(self) -> ForecastOptions:
         """The options of the forecast; `InputError` for ones that this way does not take."""
-        usual = ForecastFlags()
+        usual, known = ForecastFlags(), (*OWN, *FORECASTERS)
+        require(self.by in known, f"--by must be one of {', '.join(known)}, but it is {self.by!r}.")
         for name, ways in TAKEN.items():
             given = getattr(self, name) != getattr(usual, name)
             require(self.by in ways or not given, f"--{name} needs --by {', '.join(ways[:-1])} or {ways[-1]}.")
@@ -111,9 +113,9 @@ class ForecastFlags:
             self.times, step, model, self._dynamics(model), learned, decides, self.half_sets, self.effort
         )
 
-    def _learned(self) -> GraphForecast | DmdForecast | SindyForecast | None:
-        if self.by == "dmd" or self.by == "sindy":
-            return (DmdForecast if self.by == "dmd" else SindyForecast)(self.window, self.keep_volume)
+    def _learned(self) -> Forecaster | None:
+        if self.by not in OWN:
+            return FORECASTERS[self.by](self.window, self.keep_volume)
         if self.by in ("graph", "hybrid", "auto"):
             return GraphForecast(self.weights, self.window, self.keep_volume)
         return None

@@ -11,6 +11,7 @@ import numpy as np
 from ..checks import InputError, in_range
 from ..inference import Decision, Score, select
 from ..mesh import TriangleMesh, across, areas
+from ..plugins import Extended
 from ..ranges import ranged
 from ..representations import MovingSurfaces, TimeBasis
 from ..representations.flow import path_positions
@@ -118,6 +119,11 @@ class Forecaster(Protocol):
     def fit(self, history: History) -> Model:
         """The motion that the history tells."""
         ...
+
+
+FORECASTERS: Extended[Callable[[int, bool], Forecaster]] = Extended({}, "holosplat.forecasters")
+"""Ways that other packages add (docs/adding.md), by name: of a window, the number of the last times that are seen (0:
+all), and of whether bodies keep their volume."""
 
 
 def early_count(times: int) -> int:

@@ -22,7 +22,6 @@ from ..motion.dynamics import DynamicsForecast, HybridForecast, window_of
 from ..motion.forecast import SAME_TIME, Forecast, Forecaster, Halves, History, PathForecast, decided
 from ..motion.learned import GraphForecast, read_dynamics
 from ..motion.measures import early_part, half_fit, half_sets
-from ..motion.modes import DmdForecast, SindyForecast
 from ..optics.background import Light
 from ..progress import FitProgress
 from ..ranges import Many, Positive, Seconds, checked_dataclass
@@ -58,7 +57,7 @@ class ForecastOptions:
     """How paths go on."""
     dynamics: DynamicsForecast | None = None
     """How cells go on by mechanics (default: all bodies go on their paths)."""
-    learned: GraphForecast | DmdForecast | SindyForecast | None = None
+    learned: Forecaster | None = None
     """How bodies go on by what was learnt; with `dynamics`, by the mean of both."""
     decides: bool = False
     """Whether paths, what was learnt and the mean compete, by the last third of the run's times."""

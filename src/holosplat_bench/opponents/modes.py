@@ -17,11 +17,21 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from ..checks import MissingError, require
-from ..inference import Decision, Score, select
-from ..ranges import ManyOrNone, ranged
-from ..representations import MovingSurfaces
-from .forecast import Forecast, Halves, History, Model, Places, half_apart, of_kept_volume, places_of, told_by
+from holosplat.checks import MissingError, require
+from holosplat.inference import Decision, Score, select
+from holosplat.motion.forecast import (
+    Forecast,
+    Halves,
+    History,
+    Model,
+    Places,
+    half_apart,
+    of_kept_volume,
+    places_of,
+    told_by,
+)
+from holosplat.ranges import ManyOrNone, ranged
+from holosplat.representations import MovingSurfaces
 
 ORDERS: dict[str, tuple[tuple[int, int], ...]] = {
     "dmd": ((2, 2), (3, 2), (4, 2), (4, 4), (6, 4)),

@@ -10,9 +10,9 @@ import pytest
 from holosplat.checks import InputError, MissingError
 from holosplat.matter import Matter
 from holosplat.motion.forecast import History
-from holosplat.motion.modes import DmdForecast, SindyForecast, _dmd, _sindy
 from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.specimens.red_cells import icosphere
+from holosplat_bench.opponents.modes import DmdForecast, SindyForecast, _dmd, _sindy
 
 SPHERE, FACES = icosphere(1)
 TIMES = 1e-5 * np.arange(18)
