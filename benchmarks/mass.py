@@ -30,7 +30,8 @@ from machine import commit
 
 import holosplat as hs
 from holosplat.matter import MatterKind
-from holosplat.specimens.phantoms import packed_balls, place_capsules
+from holosplat.specimens.phantoms import packed_balls
+from holosplat_bench.specimens.phantoms import place_capsules
 
 PIXEL, ENERGY = 1e-6, 20.0
 SQUARE, WIDE = (64, 64), (49, 65)

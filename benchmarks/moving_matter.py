@@ -29,8 +29,8 @@ from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import SmoothVolume
 from holosplat.motion.flow_reconstruction import FlowOptions, merged
 from holosplat.scan import Exposures, Scan
-from holosplat.specimens.carried import CarriedScene, Fades
 from holosplat.workflows.track import reconstruct_moving
+from holosplat_bench.specimens.carried import CarriedScene, Fades, collapsing_foam, stirred_blob
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "data" / "moving_matter.csv"
 SIDE, PIXEL, VIEWS = 64, 0.5e-6, 4
@@ -38,12 +38,10 @@ SIZE = 0.85 * SIDE * PIXEL
 MATERIAL = DeltaBeta(6e-7, 6e-10)
 PRIOR = MaterialPrior.known(MATERIAL)
 SCENES: dict[str, Callable[[int], CarriedScene]] = {
-    "stir4": lambda seed: hs.specimens.stirred_blob(SIZE, MATERIAL, seed, turn=np.radians(60)),
-    "foam4": lambda seed: hs.specimens.collapsing_foam(SIZE, MATERIAL, seed),
-    "burst4": lambda seed: hs.specimens.stirred_blob(SIZE, MATERIAL, seed, turn=np.radians(6)),
-    "fade4": lambda seed: replace(
-        hs.specimens.stirred_blob(SIZE, MATERIAL, seed, turn=np.radians(60)), fades=Fades(0.5)
-    ),
+    "stir4": lambda seed: stirred_blob(SIZE, MATERIAL, seed, turn=np.radians(60)),
+    "foam4": lambda seed: collapsing_foam(SIZE, MATERIAL, seed),
+    "burst4": lambda seed: stirred_blob(SIZE, MATERIAL, seed, turn=np.radians(6)),
+    "fade4": lambda seed: replace(stirred_blob(SIZE, MATERIAL, seed, turn=np.radians(60)), fades=Fades(0.5)),
 }
 FADING = 0.3
 """Of fade4: standard deviation expected of the logarithm's change."""

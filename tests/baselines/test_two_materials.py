@@ -31,13 +31,13 @@ from holosplat.optics.background import LightOptions
 from holosplat.representations import GaussianCloud, VoxelLines, approximate, cloud_from_shares
 from holosplat.representations.gaussians import raw_of
 from holosplat.scan import Exposures, Scan
-from holosplat.specimens.phantoms import place_capsules
 from holosplat.specimens.red_cells import random_cells
 from holosplat.specimens.scene import MeshScene
 from holosplat.volume import LineIntegrals
 from holosplat.workflows.evaluate import evaluate
 from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
 from holosplat.workflows.run_folder import RunFolder
+from holosplat_bench.specimens.phantoms import place_capsules
 
 PIXEL = 1e-6
 ROWS, COLUMNS = 43, 51

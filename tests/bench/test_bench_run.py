@@ -17,11 +17,11 @@ from helpers.bench_shop import MATERIAL, PITCH, Recorder, fail, make_case, suite
 from holosplat.matter import Matter
 from holosplat.optics.sampling import fringe_sampling
 from holosplat.representations import SurfaceMesh, VoxelGrid
-from holosplat.specimens.phantoms import star_of_balls
 from holosplat.workflows.evaluate import score_object
 from holosplat_bench.declaration import Case
 from holosplat_bench.opponents.fields import NeuralField
 from holosplat_bench.opponents.fields.neural_field import Network
+from holosplat_bench.specimens.phantoms import star_of_balls
 from holosplat_bench.suite import methods, run
 from holosplat_bench.suite.folder import BenchFolder, Row, read_row, write_row
 from holosplat_bench.suite.methods import REFERENCES

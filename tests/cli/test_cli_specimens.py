@@ -103,7 +103,7 @@ def test_light_is_in_the_frames_and_in_the_file(tmp_path):
         (["--specimen", "stirred-blob"], "moves; give --frame-rate"),
         (["--specimen", "stirred-blob", "--frame-rate", 100], "--frames of two or more"),
         (["--specimen", "stirred-blob", "--frame-rate", 1, "--frames", 2, "--start", 1], "leave --start"),
-        (["--specimen", "tissue", "--specimen-motion", 3], "--specimen-motion is of stirred-blob"),
+        (["--specimen", "tissue", "--specimen-motion", 3], "--specimen-motion is of matter that moves"),
         (["--specimen", "tissue", "--bandwidth", 0.01], "a spectrum needs meshes of files"),
         (["--specimen", "tissue", "--specimen-seed", -1], "specimen-seed must not be negative"),
         (["--specimen", "tissue", "--light-drift-px", 3], "light_drift_px moves the pattern"),
@@ -135,10 +135,16 @@ def test_the_truth_in_other_formats_is_imaged_again(suffix, tmp_path):
     assert not (tmp_path / "x.nxs").exists()
 
 
-@pytest.mark.parametrize(("kind", "goes"), [("stirred-blob", 90), ("collapsing-foam", 0.3)])
-def test_specimens_that_move_give_series(kind, goes, tmp_path):
+@pytest.mark.parametrize(
+    ("kind", "how"),
+    [
+        ("stirred-blob", ("--specimen-motion", 90)),
+        ("collapsing-foam", ("--specimen-motion", 0.3, "--specimen-count", 2)),
+    ],
+)
+def test_specimens_that_move_give_series(kind, how, tmp_path):
     out, truth = tmp_path / "series.nxs", tmp_path / "truth.h5"
-    moving = ["--specimen", kind, "--specimen-motion", goes, "--specimen-count", 2, "--frame-rate", 1e5, "--frames", 3]
+    moving = ["--specimen", kind, *how, "--frame-rate", 1e5, "--frames", 3]
     field = ["--detector", 20, 23, "--pixel-size", "2e-6", "--views", 2, "--material", "PMMA", "--test-every", 0]
     ran("simulate", *moving, *field, "--out", out, "--truth", truth, "--truth-frames", 0, 2)
     scan = read_scan(out)
@@ -248,7 +254,7 @@ def test_every_kind_that_changes_is_generated_at_its_times(kind, tmp_path):
         (["--specimen", "jet", "--specimen-set", "wall=0.1"], "the setting wall is not known; use one of size, count"),
         (["--specimen", "jet", "--specimen-set", "amplitude=0.9"], "amplitude must be below 0.7"),
         (["--specimen", "jet", "--core", "iron"], "--core is not of the jet"),
-        (["--specimen", "jet", "--specimen-motion", 3], "--specimen-motion is of stirred-blob"),
+        (["--specimen", "jet", "--specimen-motion", 3], "--specimen-motion is of matter that moves"),
         (["--specimen", "jet", "--specimen-edge", "1e-6"], "--specimen-edge is not of the jet"),
         (["--specimen", "jet", "--bandwidth", 0.01], "a spectrum needs meshes of files"),
         (["--specimen", "crack", "--specimen-count", 3], "--specimen-count is not of the crack"),

@@ -11,8 +11,8 @@ from holosplat.geometry import Views
 from holosplat.matter import DeltaBeta
 from holosplat.optics.background import LightOptions
 from holosplat.scan import Exposures, Scan
-from holosplat.specimens.carried import CarriedScene, Fades
 from holosplat.specimens.continuous import Bump, ContinuousScene, ellipsoid
+from holosplat_bench.specimens.carried import CarriedScene, Fades
 
 PIXEL, SHAPE = 1e-6, (19, 23)
 MATTER = DeltaBeta(8e-7, 8e-10)

@@ -22,7 +22,7 @@ from holosplat.methods.volume import material_of_levels
 from holosplat.representations import VoxelGrid
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens import MeshScene
-from holosplat.specimens.phantoms import place_capsules
+from holosplat_bench.specimens.phantoms import place_capsules
 
 PIXEL = 1e-6
 WATER = DeltaBeta(6e-7, 4e-10)

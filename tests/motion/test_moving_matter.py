@@ -20,7 +20,7 @@ from holosplat.motion.flow_reconstruction import MOTION, STILL, FlowOptions, Flo
 from holosplat.motion.timed_frames import merged, of_degree, on_lattice
 from holosplat.representations import Flow, Lattice, TimeBasis, VoxelGrid
 from holosplat.scan import Scan
-from holosplat.specimens.carried import CarriedScene
+from holosplat_bench.specimens.carried import CarriedScene
 
 QUICK = SmoothVolume(coarser=(), rounds=1, iterations=8)
 

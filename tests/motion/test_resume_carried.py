@@ -15,6 +15,7 @@ from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import SmoothVolume, Task
 from holosplat.motion.flow_reconstruction import FlowOptions, FlowResult, FlowSearch
 from holosplat.scan import Exposures, Scan
+from holosplat_bench.specimens.carried import stirred_blob
 
 MATTER = DeltaBeta(8e-7, 8e-10)
 QUICK = FlowOptions(
@@ -25,7 +26,7 @@ QUICK = FlowOptions(
 
 @pytest.fixture(scope="module")
 def scan() -> Scan:
-    scene = hs.specimens.stirred_blob(14e-6, MATTER, 1, turn=0.6)
+    scene = stirred_blob(14e-6, MATTER, 1, turn=0.6)
     views = hs.Views.from_angles(np.array([0.0, 60.0, 110.0]), (19, 23), 1e-6)
     exposures = Exposures.of(views, 20.0, 0.1).repeated(np.linspace(0.0, 1.0, 4))
     return hs.simulate(scene, exposures, photons_per_pixel=800.0, seed=1, is_test=np.zeros(len(exposures), dtype=bool))

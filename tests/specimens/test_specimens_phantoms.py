@@ -9,18 +9,11 @@ from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
 from holosplat.materials import DeltaBeta
 from holosplat.specimens import red_cells
-from holosplat.specimens.phantoms import (
-    Ball,
-    Capsule,
-    packed_balls,
-    place_capsules,
-    random_foam,
-    star_of_balls,
-    unit_ball,
-)
+from holosplat.specimens.phantoms import Ball, packed_balls, unit_ball
 from holosplat.specimens.red_cells import crowded_cells, evans_fung_cell, icosphere, place_cells
 from holosplat.specimens.repair import closed
 from holosplat.specimens.scene import MeshScene
+from holosplat_bench.specimens.phantoms import Capsule, place_capsules, random_foam, star_of_balls
 
 UM = 1e-6
 BOX = (60 * UM, 50 * UM, 70 * UM)

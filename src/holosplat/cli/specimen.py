@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
     from ..matter import DeltaBeta
     from ..optics.coherence import Spectrum
     from ..scan import Exposures
-    from ..specimens.carried import CarriedScene
     from ..specimens.continuous import ContinuousScene
     from ..specimens.drawn import Drawn, FieldKind, Truth
     from ..specimens.scene import VoxelScene
@@ -108,9 +106,7 @@ class SourceOptions:
         return said
 
 
-Moving = Literal["stirred-blob", "collapsing-foam"]
 Soft = Literal["soft-cells", "round-cell", "tissue", "head-phantom", "coated-droplets", "body-with-absorber"]
-CARRIED: tuple[Moving, ...] = get_args(Moving)
 CORED = ("coated-droplets", "body-with-absorber")
 USUAL_COUNT = 9
 """Cells or droplets unless --specimen-count says otherwise."""
@@ -181,7 +177,7 @@ class GeneratedOptions:
         """The times [T] of the frames [s], the first at 0; `InputError` where `motion` and the specimen do not fit."""
         timing = motion.timing()
         kind = self._kind()
-        if self.specimen not in CARRIED and not (kind is not None and kind.changes):
+        if kind is None or not kind.changes:
             require(timing is None, "--frame-rate is of moving meshes, or of a specimen that moves; leave it out.")
             return np.zeros(1)
         if timing is None or timing.frames is None or timing.frames < 2:
@@ -202,8 +198,8 @@ class GeneratedOptions:
         """The matter that may fill the field, with its parameters; None for other specimens."""
         kind = self._kind()
         require(
-            self.specimen_motion is None or self.specimen in CARRIED,
-            f"--specimen-motion is of {' and '.join(CARRIED)}, not of {self.specimen}; leave it.",
+            self.specimen_motion is None or (kind is not None and hasattr(kind, "motion")),
+            f"--specimen-motion is of matter that moves, not of {self.specimen}; leave it.",
         )
         of_bubbles = self.specimen_radii is not None or self.specimen_overlap
         require(
@@ -218,8 +214,14 @@ class GeneratedOptions:
             return None
         given: dict[str, Any] = {} if self.specimen_count is None else {"count": self.specimen_count}
         require(not given or hasattr(kind, "count"), f"--specimen-count is not of the {self.specimen}; leave it.")
-        require(self.specimen_edge is None, f"--specimen-edge is not of the {self.specimen}; leave it.")
         size = self.specimen_size or kind.extent * min(beamline.detector) * beamline.pixel_size
+        if hasattr(kind, "edge"):
+            given["edge"] = self._edge(size, beamline) / size
+        require(
+            "edge" in given or self.specimen_edge is None, f"--specimen-edge is not of the {self.specimen}; leave it."
+        )
+        if self.specimen_motion is not None:
+            given["motion"] = self.specimen_motion
         if self.specimen_radii is not None:
             given["radii"] = tuple(radius / size for radius in self.specimen_radii)
         if self.specimen_overlap:
@@ -262,33 +264,27 @@ class GeneratedOptions:
         """The kind that may fill the field; None for others. Errors: `InputError` for a name that is none."""
         from ..specimens.drawn import KINDS
 
-        own = (*get_args(Soft), *CARRIED)
+        own = get_args(Soft)
         if self.specimen is None or self.specimen in own:
             return None
         known = f"--specimen must be one of {', '.join((*own, *KINDS))}, but it is {self.specimen!r}."
         require(self.specimen in KINDS, known)
         return KINDS[self.specimen]
 
-    def scene(
-        self, beamline: BeamlineOptions, filling: Filling, duration: float = 0.0
-    ) -> ContinuousScene | CarriedScene:
-        """A specimen that ends in the beamline's field of view; duration: from the first frame to the last [s]."""
-        from ..specimens import carried, soft_matter
+    def _edge(self, size: float, beamline: BeamlineOptions) -> float:
+        """Width of the edges [m] of what is `size` [m] wide."""
+        return min(3 * beamline.pixel_size, 0.04 * size) if self.specimen_edge is None else self.specimen_edge
+
+    def scene(self, beamline: BeamlineOptions, filling: Filling) -> ContinuousScene:
+        """A specimen that ends in the beamline's field of view."""
+        from ..specimens import soft_matter
 
         assert self.specimen is not None
-        pixel = beamline.pixel_size
-        size = self.specimen_size or 0.85 * min(beamline.detector) * pixel
-        edge, seed, box = self.specimen_edge, self.specimen_seed, (size, size, size)
+        size = self.specimen_size or 0.85 * min(beamline.detector) * beamline.pixel_size
+        edge, seed, box = self._edge(size, beamline), self.specimen_seed, (size, size, size)
         count = USUAL_COUNT if self.specimen_count is None else self.specimen_count
-        edge = min(3 * pixel, 0.04 * size) if edge is None else edge
         matter = filling.of(self.specimen, beamline.energy_kev)
-        core, goes = self._core(filling, beamline.energy_kev), self.specimen_motion
-        if self.specimen == "stirred-blob":
-            turn = math.radians(60.0 if goes is None else goes)
-            return carried.stirred_blob(size, matter, seed, turn, duration)
-        if self.specimen == "collapsing-foam":
-            lost = 0.5 if goes is None else goes
-            return carried.collapsing_foam(size, matter, seed, lost, duration, count, edge)
+        core = self._core(filling, beamline.energy_kev)
         if self.specimen == "soft-cells":
             return soft_matter.soft_cells(count, (0.2 * size, 0.35 * size), box, matter, seed, edge)
         if self.specimen == "round-cell":
@@ -328,7 +324,7 @@ class SpecimenOptions:
 
     def continuous(
         self, paths: tuple[Path, ...], beamline: BeamlineOptions, filling: Filling, duration: float = 0.0
-    ) -> ContinuousScene | CarriedScene | VoxelScene | Drawn | None:
+    ) -> ContinuousScene | VoxelScene | Drawn | None:
         """The specimen, unless `paths` are meshes; `InputError` for a mixture. duration: of its motion [s]."""
         from ..io.formats import FORMATS
 
@@ -337,7 +333,7 @@ class SpecimenOptions:
             require(not paths, "--specimen generates what is imaged; give it or files, not both.")
             if self.generated.in_field(beamline) is not None:
                 return self.generated.drawn(beamline, filling).over(duration or 1.0)
-            return self.generated.scene(beamline, filling, duration)
+            return self.generated.scene(beamline, filling)
         require(len(paths) > 0, "simulate needs mesh files, a volume, or --specimen.")
         if not of_volume:
             require(self.volume == VolumeOptions(), "--voxel-size and --value-delta are of TIFF images, not of meshes.")

@@ -1,7 +1,3 @@
-from .carried import CarriedScene as CarriedScene
-from .carried import Twist as Twist
-from .carried import collapsing_foam as collapsing_foam
-from .carried import stirred_blob as stirred_blob
 from .continuous import Bump as Bump
 from .continuous import ContinuousScene as ContinuousScene
 from .continuous import Element as Element
@@ -17,12 +13,7 @@ from .membrane.model import Elasticity as Elasticity
 from .membrane.model import Membrane as Membrane
 from .membrane.rest import resting_cell as resting_cell
 from .phantoms import Ball as Ball
-from .phantoms import Capsule as Capsule
-from .phantoms import Foam as Foam
 from .phantoms import packed_balls as packed_balls
-from .phantoms import place_capsules as place_capsules
-from .phantoms import random_foam as random_foam
-from .phantoms import star_of_balls as star_of_balls
 from .red_cells import crowded_cells as crowded_cells
 from .red_cells import evans_fung_cell as evans_fung_cell
 from .red_cells import place_cells as place_cells

@@ -99,13 +99,17 @@ class Drawn:
         return replace(self, scene=spread(self.scene), regions={k: spread(one) for k, one in self.regions.items()})
 
 
+Named = tuple[str | None, str | None, str | None]
+"""Names of a material (None: it must be given), a core (None: there is none) and a medium (None: vacuum)."""
+
+
 @dataclass(frozen=True)
 class FieldKind(SpecimenKind, ABC):
     """A kind that may fill the field: a frozen dataclass whose fields are its parameters, all but `size` shares of it
-    unless they say otherwise. named: names of the usual material, core and medium (None: no core; vacuum); extent: the
+    unless they say otherwise. named: names of the usual material, core and medium; extent: the
     usual size, in units of the shorter side of the field of view; changes: whether it changes with time."""
 
-    named: ClassVar[tuple[str, str | None, str | None]]
+    named: ClassVar[Named]
     extent: ClassVar[float]
     changes: ClassVar[bool] = False
     size: float

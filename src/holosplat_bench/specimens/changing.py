@@ -1,5 +1,6 @@
 """Matter that changes its shape or its topology in time: drops that merge, a bubble that collapses, a jet that breaks,
-a lattice that is crushed (and, in `gas_waves`, a shock that runs). Each kind is drawn anew at every time.
+a lattice that is crushed, and what `carried` moves (in `gas_waves`, a shock that runs). Each kind is drawn anew at
+every time.
 
 As of `specimens.drawn`, lengths are shares of `size`. Times are shares of the course: 0 at the first frame, 1 at the
 last; a `Drawn` is spread over seconds by `Drawn.over`.
@@ -7,6 +8,7 @@ last; a `Drawn` is spread over seconds by `Drawn.over`.
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from typing import ClassVar
 
@@ -18,12 +20,13 @@ from scipy.special import iv, logsumexp
 from holosplat.checks import require
 from holosplat.matter import DeltaBeta
 from holosplat.mesh import TriangleMesh
-from holosplat.ranges import Positive, Share, Small, SomeShare, checked_dataclass
+from holosplat.ranges import Many, Positive, Share, Signed, Small, SomeShare, checked_dataclass
 from holosplat.specimens.continuous import random_direction, random_rotation
-from holosplat.specimens.drawn import ChangingScene, Drawn, FieldKind, Substances
+from holosplat.specimens.drawn import ChangingScene, Drawn, FieldKind, Named, Substances
 from holosplat.specimens.phantoms import Ball, unit_ball
 from holosplat.specimens.scene import MeshScene
 
+from .carried import collapsing_foam, stirred_blob
 from .fluids import FASTEST
 from .rods import Rod, RodScene
 from .shapes import LONG, SHARE, lathe, meshed, region
@@ -43,7 +46,7 @@ class MergingDrops(FieldKind):
 
     kind: ClassVar[str] = "merging-drops"
     changes: ClassVar[bool] = True
-    named: ClassVar[tuple[str, str | None, str | None]] = ("water", None, None)
+    named: ClassVar[Named] = ("water", None, None)
     extent: ClassVar[float] = 0.8
     size: Small
     """Length of both drops with their gap at the first time [m]."""
@@ -137,7 +140,7 @@ class Collapse(FieldKind):
 
     kind: ClassVar[str] = "collapse"
     changes: ClassVar[bool] = True
-    named: ClassVar[tuple[str, str | None, str | None]] = ("water", None, None)
+    named: ClassVar[Named] = ("water", None, None)
     goes_on: ClassVar[bool] = True
     extent: ClassVar[float] = 0.55
     size: Small
@@ -210,7 +213,7 @@ class PinchingJet(FieldKind):
 
     kind: ClassVar[str] = "pinching-jet"
     changes: ClassVar[bool] = True
-    named: ClassVar[tuple[str, str | None, str | None]] = ("water", None, None)
+    named: ClassVar[Named] = ("water", None, None)
     goes_on: ClassVar[bool] = True
     extent: ClassVar[float] = 0.16
     size: Small
@@ -296,3 +299,46 @@ class CrushedLattice(Lattice):
             return Rod(ends[0], ends[1], one.radius / float(np.sqrt(longer)))
 
         return ChangingScene(lambda share: RodScene(tuple(rod(one, share) for one in rods), matter))
+
+
+@checked_dataclass
+class StirredBlob(FieldKind):
+    """`carried.stirred_blob`: a graded body with soft lumps, stirred by two vortices."""
+
+    kind: ClassVar[str] = "stirred-blob"
+    changes: ClassVar[bool] = True
+    named: ClassVar[Named] = (None, None, None)
+    extent: ClassVar[float] = 0.85
+    size: Small
+    """Diameter of the ball that it never leaves [m]."""
+    motion: Signed = 60.0
+    """Turn of the middle of the first vortex over the course [degrees]."""
+
+    def drawn(self, substances: Substances, seed: int) -> Drawn:
+        """The blob that `seed` gives."""
+        scene = stirred_blob(self.size, substances.contrast, seed, math.radians(self.motion))
+        return Drawn(ChangingScene(scene.at), f"a stirred blob, seed {seed}")
+
+
+@checked_dataclass
+class CollapsingFoam(FieldKind):
+    """`carried.collapsing_foam`: a drop whose bubbles lose gas."""
+
+    kind: ClassVar[str] = "collapsing-foam"
+    changes: ClassVar[bool] = True
+    named: ClassVar[Named] = (None, None, None)
+    extent: ClassVar[float] = 0.85
+    size: Small
+    """Diameter of the drop at the first time [m]."""
+    count: Many = 9
+    """Bubbles."""
+    edge: SomeShare = 0.04
+    """Width of the edges."""
+    motion: Share = 0.5
+    """Share of the gas that is lost over the course."""
+
+    def drawn(self, substances: Substances, seed: int) -> Drawn:
+        """The foam that `seed` gives."""
+        edge = self.edge * self.size
+        scene = collapsing_foam(self.size, substances.contrast, seed, self.motion, 1.0, self.count, edge)
+        return Drawn(ChangingScene(scene.at), f"a foam of {self.count} bubbles that lose gas, seed {seed}")

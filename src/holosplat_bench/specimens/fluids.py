@@ -14,7 +14,7 @@ from holosplat.checks import InputError, require
 from holosplat.mesh import TriangleMesh
 from holosplat.ranges import Many, ManyOrNone, Share, Small, SomeShare, checked_dataclass
 from holosplat.specimens.continuous import NODES, WEIGHTS, ContinuousScene, Soft, ellipsoid
-from holosplat.specimens.drawn import Drawn, FieldKind, Substances
+from holosplat.specimens.drawn import Drawn, FieldKind, Named, Substances
 from holosplat.specimens.phantoms import Ball
 
 from .rods import RodScene, random_bubbles
@@ -87,7 +87,7 @@ class Bubbles(FieldKind):
 
     kind: ClassVar[str] = "bubbles"
     goes_on: ClassVar[bool] = True
-    named: ClassVar[tuple[str, str | None, str | None]] = ("air", None, "water")
+    named: ClassVar[Named] = ("air", None, "water")
     extent: ClassVar[float] = 0.85
     size: Small
     """Diameter and height of the cylinder about the rotation axis in which they lie [m]."""
@@ -113,7 +113,7 @@ class Flotation(FieldKind):
     kind: ClassVar[str] = "flotation"
     has_core: ClassVar[bool] = True
     goes_on: ClassVar[bool] = True
-    named: ClassVar[tuple[str, str | None, str | None]] = ("air", "glass", "water")
+    named: ClassVar[Named] = ("air", "glass", "water")
     extent: ClassVar[float] = 0.85
     size: Small
     """Diameter and height of the cylinder about the rotation axis in which they lie [m]."""
@@ -146,7 +146,7 @@ class Cuvette(FieldKind):
     kind: ClassVar[str] = "cuvette"
     has_core: ClassVar[bool] = True
     goes_on: ClassVar[bool] = True
-    named: ClassVar[tuple[str, str | None, str | None]] = ("glass", "water", None)
+    named: ClassVar[Named] = ("glass", "water", None)
     extent: ClassVar[float] = 0.6
     size: Small
     """Outer width [m]."""
@@ -178,7 +178,7 @@ class Jet(FieldKind):
 
     kind: ClassVar[str] = "jet"
     goes_on: ClassVar[bool] = True
-    named: ClassVar[tuple[str, str | None, str | None]] = ("water", None, None)
+    named: ClassVar[Named] = ("water", None, None)
     extent: ClassVar[float] = 0.45
     size: Small
     """Diameter of the undisturbed jet [m]."""
@@ -216,7 +216,7 @@ class BreakUp(FieldKind):
     """
 
     kind: ClassVar[str] = "break-up"
-    named: ClassVar[tuple[str, str | None, str | None]] = ("water", None, None)
+    named: ClassVar[Named] = ("water", None, None)
     extent: ClassVar[float] = 0.82
     size: Small
     """Height and diameter of the spray [m]."""
@@ -294,7 +294,7 @@ class Shock(FieldKind):
 
     kind: ClassVar[str] = "shock"
     goes_on: ClassVar[bool] = True
-    named: ClassVar[tuple[str, str | None, str | None]] = ("air", None, "water")
+    named: ClassVar[Named] = ("air", None, "water")
     extent: ClassVar[float] = 0.8
     size: Small
     """Diameter of the front [m]."""

@@ -12,7 +12,7 @@ import numpy as np
 from holosplat.checks import require
 from holosplat.ranges import Positive, Share, Small, SomeShare, checked_dataclass
 from holosplat.specimens.continuous import ContinuousScene, Soft, ellipsoid, random_direction
-from holosplat.specimens.drawn import ChangingScene, Drawn, FieldKind, Substances
+from holosplat.specimens.drawn import ChangingScene, Drawn, FieldKind, Named, Substances
 
 from .shapes import SHARE
 
@@ -121,7 +121,7 @@ class ExpandingShock(FieldKind):
     kind: ClassVar[str] = "expanding-shock"
     changes: ClassVar[bool] = True
     goes_on: ClassVar[bool] = True
-    named: ClassVar[tuple[str, str | None, str | None]] = ("water", None, "water")
+    named: ClassVar[Named] = ("water", None, "water")
     extent: ClassVar[float] = 0.85
     size: Small
     """Diameter of the front at the last time [m]."""

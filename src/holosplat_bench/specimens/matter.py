@@ -13,13 +13,14 @@ from holosplat.mesh import TriangleMesh
 from holosplat.ranges import Many, Seed, Share, Small, SomeShare, checked_dataclass
 from holosplat.specimens.continuous import ContinuousScene
 from holosplat.specimens.drawn import SpecimenKind
-from holosplat.specimens.phantoms import Ball, place_capsules, random_foam
+from holosplat.specimens.phantoms import Ball
 from holosplat.specimens.red_cells import crowded_cells, random_cells
 from holosplat.specimens.soft_matter import soft_cells
 
 from .changing import Collapse, CrushedLattice, MergingDrops, PinchingJet
 from .fluids import BreakUp, Bubbles, Cuvette, Flotation, Jet, Shock
 from .gas_waves import ExpandingShock
+from .phantoms import place_capsules, random_foam
 from .solids import Channel, Crack, Fibres, Keyhole, Lattice, Star
 
 FieldMatter = (

@@ -11,7 +11,7 @@ import numpy as np
 
 from holosplat.checks import require
 from holosplat.ranges import Many, ManyOrNone, Share, Small, SomeShare, checked_dataclass
-from holosplat.specimens.drawn import Drawn, FieldKind, Substances
+from holosplat.specimens.drawn import Drawn, FieldKind, Named, Substances
 from holosplat.specimens.red_cells import random_cells
 
 from .rods import Rod, RodScene
@@ -29,7 +29,7 @@ class Crack(FieldKind):
 
     kind: ClassVar[str] = "crack"
     goes_on: ClassVar[bool] = True
-    named: ClassVar[tuple[str, str | None, str | None]] = ("air", None, "PMMA")
+    named: ClassVar[Named] = ("air", None, "PMMA")
     extent: ClassVar[float] = 0.8
     size: Small
     """Diameter of the crack [m]."""
@@ -68,7 +68,7 @@ class Keyhole(FieldKind):
 
     kind: ClassVar[str] = "keyhole"
     goes_on: ClassVar[bool] = True
-    named: ClassVar[tuple[str, str | None, str | None]] = ("titanium", None, None)
+    named: ClassVar[Named] = ("titanium", None, None)
     extent: ClassVar[float] = 0.6
     size: Small
     """Width of the bar [m]."""
@@ -112,7 +112,7 @@ class Lattice(FieldKind):
     """A cube of body-centred cubic unit cells, whose struts lead from the corners to the middle of each."""
 
     kind: ClassVar[str] = "lattice"
-    named: ClassVar[tuple[str, str | None, str | None]] = ("PMMA", None, None)
+    named: ClassVar[Named] = ("PMMA", None, None)
     extent: ClassVar[float] = 0.6
     size: Small
     """Edge of the cube [m]."""
@@ -145,7 +145,7 @@ class Fibres(FieldKind):
 
     kind: ClassVar[str] = "fibres"
     goes_on: ClassVar[bool] = True
-    named: ClassVar[tuple[str, str | None, str | None]] = ("nylon", None, None)
+    named: ClassVar[Named] = ("nylon", None, None)
     extent: ClassVar[float] = 0.85
     size: Small
     """Diameter of the cylinder through whose middle plane they go [m]."""
@@ -179,7 +179,7 @@ class Channel(FieldKind):
     kind: ClassVar[str] = "channel"
     has_core: ClassVar[bool] = True
     goes_on: ClassVar[bool] = True
-    named: ClassVar[tuple[str, str | None, str | None]] = ("plasma", "red cell", "glass")
+    named: ClassVar[Named] = ("plasma", "red cell", "glass")
     extent: ClassVar[float] = 0.65
     size: Small
     """Width of the channel along x [m]."""
@@ -209,7 +209,7 @@ class Star(FieldKind):
     """
 
     kind: ClassVar[str] = "star"
-    named: ClassVar[tuple[str, str | None, str | None]] = ("PMMA", None, None)
+    named: ClassVar[Named] = ("PMMA", None, None)
     extent: ClassVar[float] = 0.85
     size: Small
     """Diameter [m]."""

@@ -14,11 +14,21 @@ from typing import Protocol
 import numpy as np
 import torch
 
-from ..checks import finite, in_range, require
-from ..geometry import Grid, Views
-from ..matter import DeltaBeta
-from ..volume import LineIntegrals, Volume
-from .continuous import Bump, ContinuousScene, Element, Soft, ellipsoid, random_direction, random_rotation, scaled
+from holosplat.checks import finite, in_range, require
+from holosplat.geometry import Grid, Views
+from holosplat.matter import DeltaBeta
+from holosplat.specimens.continuous import (
+    Bump,
+    ContinuousScene,
+    Element,
+    Soft,
+    ellipsoid,
+    random_direction,
+    random_rotation,
+    scaled,
+)
+from holosplat.volume import LineIntegrals, Volume
+
 from .phantoms import random_foam
 
 CORE = 0.93

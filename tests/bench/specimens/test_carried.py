@@ -10,8 +10,8 @@ import pytest
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views, rotation_tilted
 from holosplat.matter import DeltaBeta
-from holosplat.specimens.carried import CarriedScene, Chain, Sink, Sinks, Twist, collapsing_foam, stirred_blob
 from holosplat.specimens.continuous import ContinuousScene, Soft, ellipsoid
+from holosplat_bench.specimens.carried import CarriedScene, Chain, Sink, Sinks, Twist, collapsing_foam, stirred_blob
 
 MATTER = DeltaBeta(2e-7, 2e-10)
 TWIST = Twist((1e-6, 0.0, -2e-6), (0.2, 1.0, 0.1), 3.0, 6e-6)
