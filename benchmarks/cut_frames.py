@@ -24,6 +24,7 @@ from machine import commit
 from rows import written
 
 import holosplat as hs
+from holosplat_bench.specimens.soft_matter import round_cell, tissue
 
 PIXEL, ENERGY, VIEWS, SEED = 1e-6, 20.0, 12, 3
 SOFT, DARK = hs.DeltaBeta(3e-7, 2e-10), hs.DeltaBeta(1e-6, 1e-8)
@@ -49,8 +50,8 @@ METHODS = {**hs.methods.METHODS, "in the field": replace(SMOOTH, volume=replace(
 def body(name: str, material: hs.DeltaBeta) -> tuple[hs.volume.Object, tuple[int, int]]:
     """The body, and the frames that hold all of it."""
     if name == "tissue":
-        return hs.specimens.tissue((80e-6, 200e-6, 80e-6), material, SEED), (220, 120)
-    return hs.specimens.round_cell(88e-6, material, SEED), (120, 120)
+        return tissue((80e-6, 200e-6, 80e-6), material, SEED), (220, 120)
+    return round_cell(88e-6, material, SEED), (120, 120)
 
 
 def row(name: str, rows: int, distance: float, photons: float | None, method: str) -> dict[str, str]:

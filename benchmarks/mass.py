@@ -31,6 +31,7 @@ from machine import commit
 import holosplat as hs
 from holosplat.matter import MatterKind
 from holosplat.specimens.phantoms import packed_balls
+from holosplat_bench.specimens import soft_matter
 from holosplat_bench.specimens.phantoms import place_capsules
 
 PIXEL, ENERGY = 1e-6, 20.0
@@ -105,13 +106,13 @@ def soft(seed: int) -> Sample:
 def tissue(seed: int) -> Sample:
     """A piece of tissue that fills most of the field."""
     material = hs.DeltaBeta(1.2e-7, 6e-11)
-    return Sample(hs.specimens.tissue(box(SQUARE, 0.85), material, seed), material, SQUARE, 0.1, "continuous")
+    return Sample(soft_matter.tissue(box(SQUARE, 0.85), material, seed), material, SQUARE, 0.1, "continuous")
 
 
 def round_cell(seed: int) -> Sample:
     """A round cell of 3 rad."""
     material = hs.DeltaBeta(6e-7, 4e-10)
-    return Sample(hs.specimens.round_cell(46 * PIXEL, material, seed), material, SQUARE, 0.03, "continuous")
+    return Sample(soft_matter.round_cell(46 * PIXEL, material, seed), material, SQUARE, 0.03, "continuous")
 
 
 def balls(seed: int) -> Sample:

@@ -27,6 +27,7 @@ from rows import written
 
 import holosplat as hs
 from holosplat.model import measure
+from holosplat_bench.specimens.soft_matter import round_cell
 
 PIXEL, ENERGY, RATIO, TEST = 1e-6, 20.0, 1e5, 3
 MATERIAL = hs.DeltaBeta(6.8e-7, 6.8e-12)
@@ -82,7 +83,7 @@ CASES = {
 def row(name: str, seed: int, told: str) -> dict[str, str]:
     """A row of the table."""
     case = CASES[name]
-    truth = hs.specimens.round_cell(0.72 * min(case.shape) * PIXEL, MATERIAL, seed)
+    truth = round_cell(0.72 * min(case.shape) * PIXEL, MATERIAL, seed)
     scan = case.scan(truth, seed)
     prior = hs.MaterialPrior.unknown() if told == "nothing" else hs.MaterialPrior.of_ratio(RATIO)
     began = time.process_time()

@@ -12,8 +12,8 @@ from holosplat.matter import DeltaBeta
 from holosplat.scan import Exposures
 from holosplat.specimens.red_cells import random_cells
 from holosplat.specimens.scene import MeshScene, MeshSeries
-from holosplat.specimens.soft_matter import shepp_logan
 from holosplat.volume import Object
+from holosplat_bench.specimens.soft_matter import shepp_logan
 
 pytest.importorskip("triton")
 

@@ -21,7 +21,7 @@ from holosplat.checks import InputError
 from holosplat.cli.entry import COMMANDS, command
 from holosplat.materials import DeltaBeta
 from holosplat.ranges import _fields, hints_of, range_of, with_checked_numbers
-from holosplat_bench.specimens.matter import CHANGING, MATTER
+from holosplat.specimens.drawn import KINDS
 
 ROOTS = [Path(package.__file__ or "").parent for package in (holosplat, holosplat_bench.suite)]
 INTERNAL = {"Group", "Choice", "_Best", "_Unread", "Mark", "Block", "Blocks", "Decision", "Fields"}
@@ -56,7 +56,7 @@ NEEDED: dict[str, dict[str, Any]] = {
     "Tissue": {"box": (1e-4, 1e-4, 1e-4)},
     "Tube": {"inner": 1e-3, "outer": 2e-3, "attenuation": 100.0},
 }
-NEEDED |= {kind.__name__: {"size": 4e-5} for kind in (*MATTER.values(), *CHANGING.values())}
+NEEDED |= {kind.__name__: {"size": 4e-5} for kind in KINDS.values()}
 """What options without a default are made of here."""
 
 MARKS = r"^((?:@.*\n)*@(?:checked_)?dataclass.*\n(?:@.*\n)*)"

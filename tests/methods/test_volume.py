@@ -27,8 +27,8 @@ from holosplat.optics.background import Light, LightOptions
 from holosplat.optics.noise import NoiseModel
 from holosplat.representations import VoxelGrid
 from holosplat.scan import Exposures, Scan
-from holosplat.specimens.soft_matter import round_cell, tissue
 from holosplat.volume import Object
+from holosplat_bench.specimens.soft_matter import round_cell, tissue
 
 pytestmark = pytest.mark.usefixtures("plain_light")
 

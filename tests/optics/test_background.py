@@ -17,7 +17,7 @@ from holosplat.model import SolvedLight
 from holosplat.optics.background import Background, Light, LightOptions
 from holosplat.optics.noise import NoiseModel
 from holosplat.scan import Exposures
-from holosplat.specimens.soft_matter import round_cell
+from holosplat_bench.specimens.soft_matter import round_cell
 
 SHAPES = [(5, 72, 72), (4, 61, 90)]
 

@@ -14,13 +14,13 @@ from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views, rotation_tilted
 from holosplat.matter import DeltaBeta
 from holosplat.specimens.continuous import Bump, ContinuousScene, Element, Soft, ellipsoid, random_rotation
-from holosplat.specimens.soft_matter import (
+from holosplat.specimens.soft_matter import soft_cells
+from holosplat_bench.specimens.soft_matter import (
     SHEPP_LOGAN,
     body_with_absorber,
     coated_droplets,
     round_cell,
     shepp_logan,
-    soft_cells,
     tissue,
 )
 

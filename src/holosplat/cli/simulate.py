@@ -267,9 +267,8 @@ def _still(
         said = imaged.generated.facts(beamline)
     if not isinstance(generated, Drawn):
         return _Specimen(generated, times, said)
-    found = imaged.generated.in_field(beamline)
-    goes_on = found is not None and found.goes_on
-    return _Specimen(generated.scene, times, said | {"specimen_drawn": generated.text}, generated.regions, goes_on)
+    said |= {"specimen_drawn": generated.text}
+    return _Specimen(generated.scene, times, said, generated.regions, imaged.generated.matter(beamline).goes_on)
 
 
 def _say_of_missing_field(specimen: _Specimen, views: Views, pixel_size: float) -> None:

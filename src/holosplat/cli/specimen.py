@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from tyro.conf import UseAppendAction, arg
@@ -17,10 +17,8 @@ from .options import BeamlineOptions, MaterialOptions, MeshOptions, MotionOption
 
 if TYPE_CHECKING:
     from ..beamline.simulate import Filling, Simulation
-    from ..matter import DeltaBeta
     from ..optics.coherence import Spectrum
     from ..scan import Exposures
-    from ..specimens.continuous import ContinuousScene
     from ..specimens.drawn import Drawn, FieldKind, Truth
     from ..specimens.scene import VoxelScene
 
@@ -106,12 +104,6 @@ class SourceOptions:
         return said
 
 
-Soft = Literal["soft-cells", "round-cell", "tissue", "head-phantom", "coated-droplets", "body-with-absorber"]
-CORED = ("coated-droplets", "body-with-absorber")
-USUAL_COUNT = 9
-"""Cells or droplets unless --specimen-count says otherwise."""
-
-
 @checked_dataclass
 class VolumeOptions:
     """What the images of a TIFF stack show; files of `export --volume` say it themselves."""
@@ -176,8 +168,7 @@ class GeneratedOptions:
     def timing(self, motion: MotionOptions) -> np.ndarray:
         """The times [T] of the frames [s], the first at 0; `InputError` where `motion` and the specimen do not fit."""
         timing = motion.timing()
-        kind = self._kind()
-        if kind is None or not kind.changes:
+        if self.specimen is None or not self._kind().changes:
             require(timing is None, "--frame-rate is of moving meshes, or of a specimen that moves; leave it out.")
             return np.zeros(1)
         if timing is None or timing.frames is None or timing.frames < 2:
@@ -187,18 +178,17 @@ class GeneratedOptions:
         return np.arange(timing.frames) / timing.frame_rate
 
     def in_medium(self, filling: MaterialOptions) -> MaterialOptions:
-        """The materials: where they are not named, those that are usual for matter that may fill the field."""
-        kind = self._kind()
-        if kind is None:
+        """The materials: where they are not named, those that are usual for the specimen."""
+        if self.specimen is None:
             return filling
-        material, _, medium = kind.named
+        material, _, medium = self._kind().named
         return replace(filling, material=filling.material or material, medium=filling.medium or medium)
 
-    def in_field(self, beamline: BeamlineOptions) -> FieldKind | None:
-        """The matter that may fill the field, with its parameters; None for other specimens."""
+    def matter(self, beamline: BeamlineOptions) -> FieldKind:
+        """The specimen that is named, with its parameters."""
         kind = self._kind()
         require(
-            self.specimen_motion is None or (kind is not None and hasattr(kind, "motion")),
+            self.specimen_motion is None or hasattr(kind, "motion"),
             f"--specimen-motion is of matter that moves, not of {self.specimen}; leave it.",
         )
         of_bubbles = self.specimen_radii is not None or self.specimen_overlap
@@ -206,12 +196,6 @@ class GeneratedOptions:
             self.specimen == "bubbles" or not of_bubbles,
             f"--specimen-radii and --specimen-overlap are of bubbles, not of {self.specimen}; leave them.",
         )
-        require(
-            kind is not None or not self.specimen_set,
-            f"--specimen-set is of matter that may fill the field, not of {self.specimen}; leave it.",
-        )
-        if kind is None:
-            return None
         given: dict[str, Any] = {} if self.specimen_count is None else {"count": self.specimen_count}
         require(not given or hasattr(kind, "count"), f"--specimen-count is not of the {self.specimen}; leave it.")
         size = self.specimen_size or kind.extent * min(beamline.detector) * beamline.pixel_size
@@ -231,8 +215,7 @@ class GeneratedOptions:
     def facts(self, beamline: BeamlineOptions) -> dict[str, str]:
         """What the scan file says of the specimen: its kind, seed, parameters, and what is inside."""
         said = {"specimen": str(self.specimen), "specimen_seed": str(self.specimen_seed)}
-        if (found := self.in_field(beamline)) is None:
-            return said
+        found = self.matter(beamline)
         parameters = {name: value for name, value in to_table(found).items() if name != "kind"}
         lists = {name: value if isinstance(value, list) else [value] for name, value in parameters.items()}
         shown = {
@@ -243,75 +226,33 @@ class GeneratedOptions:
         return said | {f"specimen_{name}": text for name, text in shown.items()} | core
 
     def drawn(self, beamline: BeamlineOptions, filling: Filling) -> Drawn:
-        """What `in_field` gives of the named materials."""
+        """What `matter` gives of the named materials."""
         from ..materials import parse_material
         from ..specimens.drawn import VACUUM, Substances
 
-        found = self.in_field(beamline)
-        assert found is not None
-        assert self.specimen is not None
-        energy = beamline.energy_kev
+        found, energy = self.matter(beamline), beamline.energy_kev
         cored = self.core if found.has_core else None
         require(cored == self.core, f"--core is not of the {self.specimen}; leave it.")
         require(found.has_core or self.core_density is None, f"--core-density is not of the {self.specimen}; leave it.")
         core = cored or found.named[1]
+        inside = core is not None or not found.has_core
+        require(inside, f"--specimen {self.specimen} needs --core, the material that is inside.")
         medium = VACUUM if filling.medium is None else filling.medium.delta_beta(energy)
-        material = replace(filling, medium=None).of(self.specimen, energy)
-        inside = None if core is None else parse_material(core, self.core_density).delta_beta(energy)
-        return found.drawn(Substances(material, inside, medium), self.specimen_seed)
+        material = replace(filling, medium=None).of(str(self.specimen), energy)
+        filled = None if core is None else parse_material(core, self.core_density).delta_beta(energy)
+        return found.drawn(Substances(material, filled, medium), self.specimen_seed)
 
-    def _kind(self) -> type[FieldKind] | None:
-        """The kind that may fill the field; None for others. Errors: `InputError` for a name that is none."""
+    def _kind(self) -> type[FieldKind]:
+        """The kind that is named. Errors: `InputError` for a name that is none."""
         from ..specimens.drawn import KINDS
 
-        own = get_args(Soft)
-        if self.specimen is None or self.specimen in own:
-            return None
-        known = f"--specimen must be one of {', '.join((*own, *KINDS))}, but it is {self.specimen!r}."
-        require(self.specimen in KINDS, known)
-        return KINDS[self.specimen]
+        name = str(self.specimen)
+        require(name in KINDS, f"--specimen must be one of {', '.join(KINDS)}, but it is {name!r}.")
+        return KINDS[name]
 
     def _edge(self, size: float, beamline: BeamlineOptions) -> float:
         """Width of the edges [m] of what is `size` [m] wide."""
         return min(3 * beamline.pixel_size, 0.04 * size) if self.specimen_edge is None else self.specimen_edge
-
-    def scene(self, beamline: BeamlineOptions, filling: Filling) -> ContinuousScene:
-        """A specimen that ends in the beamline's field of view."""
-        from ..specimens import soft_matter
-
-        assert self.specimen is not None
-        size = self.specimen_size or 0.85 * min(beamline.detector) * beamline.pixel_size
-        edge, seed, box = self._edge(size, beamline), self.specimen_seed, (size, size, size)
-        count = USUAL_COUNT if self.specimen_count is None else self.specimen_count
-        matter = filling.of(self.specimen, beamline.energy_kev)
-        core = self._core(filling, beamline.energy_kev)
-        if self.specimen == "soft-cells":
-            return soft_matter.soft_cells(count, (0.2 * size, 0.35 * size), box, matter, seed, edge)
-        if self.specimen == "round-cell":
-            return soft_matter.round_cell(size, matter, seed)
-        if self.specimen == "tissue":
-            return soft_matter.tissue(box, matter, seed)
-        if self.specimen == "head-phantom":
-            return soft_matter.shepp_logan(size, matter, edge)
-        if self.specimen == "coated-droplets":
-            sizes = (0.18 * size, 0.36 * size)
-            return soft_matter.coated_droplets(count, sizes, 0.04 * size, box, (core, matter), seed)
-        return soft_matter.body_with_absorber((size, 0.75 * size, 0.9 * size), matter, core, 0.16 * size, seed)
-
-    def _core(self, filling: Filling, energy_kev: float) -> DeltaBeta:
-        """δ and β of the core against the medium; of nothing where the kind has none."""
-        from ..materials import parse_material
-        from ..matter import DeltaBeta
-
-        cored = self.specimen in CORED
-        require(cored or self.core is None, f"--core is what is inside {' and '.join(CORED)}, not {self.specimen}.")
-        require(self.core is not None or self.core_density is None, "--core-density needs --core.")
-        if not cored:
-            return DeltaBeta(0.0, 0.0)
-        if self.core is None:
-            raise InputError(f"--specimen {self.specimen} needs --core, the material that is inside.")
-        found = parse_material(self.core, self.core_density).delta_beta(energy_kev)
-        return found.against(filling.medium.delta_beta(energy_kev)) if filling.medium else found
 
 
 @dataclass(frozen=True)
@@ -324,16 +265,14 @@ class SpecimenOptions:
 
     def continuous(
         self, paths: tuple[Path, ...], beamline: BeamlineOptions, filling: Filling, duration: float = 0.0
-    ) -> ContinuousScene | VoxelScene | Drawn | None:
+    ) -> VoxelScene | Drawn | None:
         """The specimen, unless `paths` are meshes; `InputError` for a mixture. duration: of its motion [s]."""
         from ..io.formats import FORMATS
 
         of_volume = [path for path in paths if path.suffix.lower() in FORMATS]
         if self.generated.specimen is not None:
             require(not paths, "--specimen generates what is imaged; give it or files, not both.")
-            if self.generated.in_field(beamline) is not None:
-                return self.generated.drawn(beamline, filling).over(duration or 1.0)
-            return self.generated.scene(beamline, filling)
+            return self.generated.drawn(beamline, filling).over(duration or 1.0)
         require(len(paths) > 0, "simulate needs mesh files, a volume, or --specimen.")
         if not of_volume:
             require(self.volume == VolumeOptions(), "--voxel-size and --value-delta are of TIFF images, not of meshes.")

@@ -21,9 +21,4 @@ from .red_cells import random_cells as random_cells
 from .repair import closed as closed
 from .scene import MeshScene as MeshScene
 from .scene import MeshSeries as MeshSeries
-from .soft_matter import body_with_absorber as body_with_absorber
-from .soft_matter import coated_droplets as coated_droplets
-from .soft_matter import round_cell as round_cell
-from .soft_matter import shepp_logan as shepp_logan
 from .soft_matter import soft_cells as soft_cells
-from .soft_matter import tissue as tissue

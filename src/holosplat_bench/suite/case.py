@@ -23,7 +23,6 @@ from holosplat.ranges import Many, ManyOrNone, Metres, Small, checked_dataclass
 from holosplat.scan import Exposures, interleaved_split
 from holosplat.specimens.continuous import ContinuousScene
 from holosplat.specimens.repair import closed
-from holosplat.specimens.soft_matter import body_with_absorber, coated_droplets, round_cell, shepp_logan, tissue
 from holosplat.tables import from_table, merged, read_table
 
 from ..declaration import Case, Declaration, Listed, case_of
@@ -40,6 +39,7 @@ from ..specimens.matter import (
     SoftCells,
 )
 from ..specimens.phantoms import star_of_balls
+from ..specimens.soft_matter import body_with_absorber, coated_droplets, round_cell, shepp_logan, tissue
 
 
 @checked_dataclass
