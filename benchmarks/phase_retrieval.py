@@ -59,7 +59,7 @@ def main() -> None:
             clean = simulate(matter, exposures).frames
             photons = 10_000 if regime == "plasma" else 2_000
             for label, frames in (("", clean), (" noisy", poisson(clean.astype(np.float64), photons, seed))):
-                for name, retrieve in (plain | RETRIEVALS).items():
+                for name, retrieve in {**plain, **RETRIEVALS}.items():
                     started = time.process_time()
                     found = retrieve(torch.from_numpy(frames), exposures, *matter.materials[0]).double()
                     seconds = (time.process_time() - started) * 12 / given.views

@@ -143,7 +143,8 @@ def test_every_view_is_retrieved_at_its_own_energy(name, beta):
 
 
 def _few_steps(name: str):
-    from holosplat.optics.retrieval import ADMM, Projections, Tikhonov
+    from holosplat.optics.retrieval import ADMM, Tikhonov
+    from holosplat_bench.opponents.alternating import Projections
 
     kinds = {"tikhonov": Tikhonov, "admm": ADMM}
     return kinds.get(name, Projections)(iterations=3)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from torch import Tensor
 from ..checks import InputError
 from ..matter import DeltaBeta
 from ..optics.background import Light, LightOptions
-from ..optics.retrieval import RETRIEVAL_OPTIONS, RETRIEVALS
+from ..optics.retrieval import RETRIEVALS, usual_options
 from ..optics.retrieval.spectra import checked, radian
 from ..progress import Advance
 from ..scan import Exposures
@@ -68,8 +68,10 @@ def retrieve(
         raise InputError(f"method must be one of {', '.join(RETRIEVALS)}, but it is {method!r}.")
     known = checked(frames, exposures, material.delta)
     found = Light.of(known, light)
-    how: dict[str, Any] = {} if found.background is None else {"options": RETRIEVAL_OPTIONS[method](noise=found.doubt)}
+    retrieval, how = RETRIEVALS[method], dict[str, Any]()
+    if found.background is not None:
+        how["options"] = replace(usual_options(retrieval), noise=found.doubt)
     how |= {"missing": None if missing is None else torch.from_numpy(missing), "on_progress": on_progress}
-    thickness = RETRIEVALS[method](found.evened(known), exposures, *material, **how)
+    thickness = retrieval(found.evened(known), exposures, *material, **how)
     phase = (-thickness / radian(exposures, material.delta)).to(thickness.dtype)
     return Retrieved(thickness, phase, found)

@@ -167,9 +167,6 @@ STAND_IN_DELTA = 1e-6
 """δ where only δ/β is known: the phase does not depend on it."""
 
 
-RetrievalName = Literal["tikhonov", "admm", "ctf", "paganin", "gerchberg-saxton", "hybrid-input-output"]
-
-
 @checked_dataclass
 class RatioOptions(OneMaterial):
     """The one material; give it, or δ/β."""
@@ -196,7 +193,7 @@ def retrieve(
     scan: Positional[Path],
     out: Output,
     matter: RatioOptions = RatioOptions(),
-    method: RetrievalName = "tikhonov",
+    method: str = "tikhonov",
     illumination: LightFlags = LightFlags(),
     reading: Reading = Reading(),
 ) -> None:
@@ -205,7 +202,8 @@ def retrieve(
     Args:
         scan: Scan: a file (NXtomo), or a folder (tiff, nerf-synthetic, r2-gaussian, or a run's).
         out: HDF5 file to write (.h5), or folder to make: a TIFF stack a map, maps.json and a preview.
-        method: Tikhonov through the full wave optics is the most reliable; docs/phase_retrieval.md compares them.
+        method: tikhonov (through the full wave optics, the most reliable), admm, ctf, paganin, gerchberg-saxton or
+            hybrid-input-output; docs/phase_retrieval.md compares them.
     """
     measured = read_frames(scan, reading).in_memory()
     check_frames(measured)

@@ -37,8 +37,8 @@ class PerView(Method):
 
     def __post_init__(self) -> None:
         for name, value, choices in (
-            ("retrieval", self.retrieval, tuple(RETRIEVALS)),
-            ("tomography", self.tomography, tuple(self.tomographies)),
+            ("retrieval", self.retrieval, RETRIEVALS),
+            ("tomography", self.tomography, self.tomographies),
         ):
             if value not in choices:
                 raise InputError(f"{name} must be one of {', '.join(choices)}, but it is {value!r}.")

@@ -1,4 +1,4 @@
-"""Phase retrieval of single views for one material: frames → projected thickness, by six methods.
+"""Phase retrieval of single views for one material: frames → projected thickness, by several methods.
 
 All have the call of `Retrieval` and stand in `RETRIEVALS`. The first two are filters; the others start from
 `bounded_estimate` and see the full wave optics, point-spread function and pixels included. How they compare:
@@ -7,22 +7,24 @@ docs/phase_retrieval.md.
 
 from __future__ import annotations
 
-from typing import Protocol
+from inspect import signature
+from typing import Any, Protocol
 
 from torch import Tensor
 
+from ...plugins import Extended
 from ...progress import Advance
 from ...scan import Exposures
 from .bounded import FIXED, Estimate, bounded_estimate
 from .contact import absorption_alone
 from .halo import without_halo
 from .linear import Linear, contrast_transfer, invert_contrast, paganin, retrieve_thickness
-from .nonlinear import ADMM, Projections, Tikhonov, admm, gerchberg_saxton, hybrid_input_output, tikhonov
+from .nonlinear import ADMM, Tikhonov, admm, tikhonov
 from .spectra import Prior
 
 
 class Retrieval(Protocol):
-    """A method of phase retrieval; beside these arguments each has its `options`."""
+    """A method of phase retrieval; beside these arguments each has its `options`, with a default."""
 
     def __call__(
         self,
@@ -45,46 +47,34 @@ class Retrieval(Protocol):
         ...
 
 
-RETRIEVALS: dict[str, Retrieval] = {
-    "paganin": paganin,
-    "ctf": contrast_transfer,
-    "tikhonov": tikhonov,
-    "gerchberg-saxton": gerchberg_saxton,
-    "hybrid-input-output": hybrid_input_output,
-    "admm": admm,
-}
-"""Every method by its name."""
+RETRIEVALS: Extended[Retrieval] = Extended(
+    {"paganin": paganin, "ctf": contrast_transfer, "tikhonov": tikhonov, "admm": admm}, "holosplat.retrievals"
+)
+"""Every method by its name; other packages add theirs (docs/adding.md)."""
 
-RETRIEVAL_OPTIONS = {
-    "paganin": Linear,
-    "ctf": Linear,
-    "tikhonov": Tikhonov,
-    "gerchberg-saxton": Projections,
-    "hybrid-input-output": Projections,
-    "admm": ADMM,
-}
-"""The class of each method's options; all have `noise`."""
+
+def usual_options(retrieve: Retrieval) -> Any:
+    """The options of a method by default; all have `noise`."""
+    return signature(retrieve).parameters["options"].default
+
 
 __all__ = [
     "ADMM",
     "FIXED",
     "RETRIEVALS",
-    "RETRIEVAL_OPTIONS",
     "Estimate",
     "Linear",
     "Prior",
-    "Projections",
     "Retrieval",
     "Tikhonov",
     "absorption_alone",
     "admm",
     "bounded_estimate",
     "contrast_transfer",
-    "gerchberg_saxton",
-    "hybrid_input_output",
     "invert_contrast",
     "paganin",
     "retrieve_thickness",
     "tikhonov",
+    "usual_options",
     "without_halo",
 ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -66,22 +67,18 @@ class Regularised:
         check_noise(self.noise)
 
 
-@checked_dataclass
-class Projections:
-    """Options of the alternating projections."""
+class WaveOptions(Protocol):
+    """Options of any retrieval through the wave optics."""
 
-    iterations: int = 40
-    """Pairs of projections."""
-    feedback: float = 0.9
-    """Factor of the values that violate the bounds, for hybrid input–output only (Fienup 1982)."""
-    noise: Noise = None
-    """Standard deviation of the frames, or their noise model (default: estimated from them)."""
-    backend: str = "cpu"
-    """Implementation of the wave optics (see `backends`)."""
+    @property
+    def noise(self) -> Noise:
+        """Standard deviation of the frames, or their noise model."""
+        ...
 
-    def __post_init__(self) -> None:
-        at_least(self, 1, "iterations")
-        check_noise(self.noise)
+    @property
+    def backend(self) -> str:
+        """Implementation of the wave optics."""
+        ...
 
 
 class WaveModel:
@@ -209,7 +206,7 @@ def view_by_view(
     frames: Tensor,
     exposures: Exposures,
     material: tuple[float, float],
-    options: Regularised | Projections,
+    options: WaveOptions,
     solve: Callable[[WaveModel, Advance], Tensor],
     beside: tuple[Gaps, bool, Advance],
 ) -> Tensor:
