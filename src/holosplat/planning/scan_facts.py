@@ -32,6 +32,7 @@ from ..methods.window import windows_of
 from ..optics.noise import NoiseModel, noise_levels, noise_share
 from ..optics.sampling import fringes, on_larger_pixels
 from ..scan import Exposures, Scan
+from ..tables import with_entries
 from ..units import beam_named, span
 from .acts import of_each_time
 from .look import LOOKED, Look, looked
@@ -295,7 +296,7 @@ def smaller(exposures: Exposures, method: Method, matter: MatterKind | None) -> 
     flag, coarse = "", method  # none where the method has no such start
     start = getattr(method, "volume", None)
     if isinstance(start, HolographicTV) and not isinstance(method, SmoothVolume):
-        flag, coarse = "--set volume.refine=1", replace(method, volume=replace(start, refine=1))
+        flag, coarse = "--set volume.refine=1", with_entries(method, {"volume": replace(start, refine=1)})
     elif isinstance(method, Auto | Surfaces):
         gaussians = replace(method.gaussians, volume=replace(method.gaussians.volume, refine=1))
         flag, coarse = "--set gaussians.volume.refine=1", replace(method, gaussians=gaussians)
