@@ -14,7 +14,6 @@ from holosplat.beamline.simulate import Simulation, simulate
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views, rotation_y
 from holosplat.io.images import read_tiff, write_tiff
-from holosplat.io.nerf_synthetic import read_nerf_synthetic, write_nerf_synthetic
 from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.materials import HAEMOGLOBIN, PLASMA, RED_CELL, WATER, dispersion
 from holosplat.matter import MaterialPrior
@@ -31,6 +30,7 @@ from holosplat.volume import LineIntegrals
 from holosplat.workflows.evaluate import evaluate
 from holosplat.workflows.provenance import scan_hash
 from holosplat.workflows.reconstruct import reconstruct
+from holosplat_bench.formats.nerf_synthetic import read_nerf_synthetic, write_nerf_synthetic
 
 SHAPE, PIXEL = (21, 27), 1.3e-6
 ENERGIES = np.array([18.0, 15.0, 24.0, 15.0])

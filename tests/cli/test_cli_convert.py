@@ -115,7 +115,7 @@ def test_r2_gaussian_there_and_back(scan, tmp_path, known):
         (("--to", "tiff", "--black", "0.1"), "black: not for a source in nxtomo"),
         (("--to", "r2-gaussian", *MATERIAL, "--truth", "none.h5"), "no such file"),
         (("--to", "nerf-synthetic", "--camera-distance", "1"), "camera_distance must be at least 10"),
-        (("--to", "jpeg"), "invalid choice"),
+        (("--to", "jpeg"), "--to must be one of nxtomo"),
         ((), "required"),
     ],
 )

@@ -34,7 +34,7 @@ geometry frames divided_light scan volume mesh matter
 ← report show
 ← series
 ← cli ← __main__
-← holosplat_bench/specimens ← holosplat_bench/declaration ← holosplat_bench/training
+← holosplat_bench/specimens holosplat_bench/formats ← holosplat_bench/declaration ← holosplat_bench/training
 ← holosplat_bench/opponents ← holosplat_bench/suite
 ← holosplat_bench/thesis
 ← holosplat_bench/cli

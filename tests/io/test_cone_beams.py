@@ -17,7 +17,6 @@ from holosplat.checks import InputError
 from holosplat.geometry import Views
 from holosplat.io.formats import read, read_as
 from holosplat.io.images import write_tiff
-from holosplat.io.nerf_synthetic import write_nerf_synthetic
 from holosplat.io.nxtomo import write_scan
 from holosplat.io.reading import Reading, Told
 from holosplat.io.vtk import write_mesh
@@ -25,6 +24,7 @@ from holosplat.optics.coherence import effective_geometry
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.red_cells import icosphere
 from holosplat.workflows.join import join
+from holosplat_bench.formats.nerf_synthetic import write_nerf_synthetic
 from holosplat_bench.opponents.neural_fields import NeuralFields
 
 SOURCE, BEHIND, PIXEL = 0.25, 0.75, 4e-6

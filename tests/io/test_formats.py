@@ -19,10 +19,10 @@ from holosplat.io import formats
 from holosplat.io.atomic import write_json
 from holosplat.io.formats import loader_of
 from holosplat.io.images import write_tiff
-from holosplat.io.nerf_synthetic import NerfOptions, write_nerf_synthetic, write_png
 from holosplat.io.nxtomo import read_scan, write_scan
-from holosplat.io.r2_gaussian import R2Options, write_r2_gaussian
 from holosplat.scan import Exposures, Scan
+from holosplat_bench.formats.nerf_synthetic import NerfOptions, write_nerf_synthetic, write_png
+from holosplat_bench.formats.r2_gaussian import R2Options, write_r2_gaussian
 
 N, SHAPE = 4, (9, 11)
 ADDING = Path(__file__).parents[2] / "docs" / "adding.md"
@@ -114,7 +114,8 @@ def test_what_is_no_scan_is_told_what_is_known(places):
     (places / "empty").mkdir()
     (places / "text.nxs").write_text("no HDF5")
     shutil.copy(places / "r2/meta_data.json", places / "nerf")
-    everything = "; ".join(re.escape(f"{loader.mark} ({loader.name})") for loader in formats.LOADERS)
+    every = (*formats.LOADERS, *formats.ADDED.values())
+    everything = "; ".join(re.escape(f"{loader.mark} ({loader.name})") for loader in every)
     for path, message in (
         (places / "none", "no such file or folder"),
         (places / "text.nxs", f"none of what is known: {everything}"),

@@ -20,7 +20,9 @@ from scipy.spatial.transform import Rotation
 from holosplat.checks import InputError
 from holosplat.geometry import Views, rotation_y
 from holosplat.io.images import read_tiff, write_tiff
-from holosplat.io.nerf_synthetic import (
+from holosplat.io.nxtomo import read_scan, write_scan
+from holosplat.scan import Exposures, Scan
+from holosplat_bench.formats.nerf_synthetic import (
     GivenOptics,
     NerfOptions,
     hull_points,
@@ -28,8 +30,6 @@ from holosplat.io.nerf_synthetic import (
     uniform_points,
     write_nerf_synthetic,
 )
-from holosplat.io.nxtomo import read_scan, write_scan
-from holosplat.scan import Exposures, Scan
 
 N, H, W = 6, 7, 10
 PIXEL = 3.2e-6

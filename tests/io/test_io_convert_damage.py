@@ -18,11 +18,11 @@ from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
 from holosplat.io.atomic import atomic_folder
 from holosplat.io.images import read_tiff, write_tiff
-from holosplat.io.nerf_synthetic import GivenOptics, NerfOptions, read_nerf_synthetic, write_nerf_synthetic
-from holosplat.io.r2_gaussian import R2Options, read_r2_gaussian, write_r2_gaussian
 from holosplat.io.solids import write_ply
 from holosplat.scan import Exposures, Scan
 from holosplat.volume import Volume
+from holosplat_bench.formats.nerf_synthetic import GivenOptics, NerfOptions, read_nerf_synthetic, write_nerf_synthetic
+from holosplat_bench.formats.r2_gaussian import R2Options, read_r2_gaussian, write_r2_gaussian
 
 N, H, W = 5, 7, 10
 READ: dict[str, Callable[[Path], Scan]] = {

@@ -16,12 +16,12 @@ from scipy.spatial.transform import Rotation
 
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views, rotation_y
-from holosplat.io.r2_gaussian import R2Options, read_r2_gaussian, write_r2_gaussian
 from holosplat.matter import Matter
 from holosplat.optics import retrieve_thickness
 from holosplat.representations.gaussians import GaussianCloud, raw_of
 from holosplat.scan import Exposures, Scan
 from holosplat.units import wavenumber
+from holosplat_bench.formats.r2_gaussian import R2Options, read_r2_gaussian, write_r2_gaussian
 
 PIXEL = 3.2e-6
 ANGLES = np.array([-20.0, 10.0, 35.0, 75.0, 110.0, 200.0])

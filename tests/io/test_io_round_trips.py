@@ -18,18 +18,8 @@ from helpers.strategies import NAMES, VIEWS, clouds, images, numbers, scans, vec
 from holosplat.geometry import Grid, Views
 from holosplat.io.atomic import read_json, write_json
 from holosplat.io.images import read_tiff, write_tiff
-from holosplat.io.nerf_synthetic import (
-    LEVELS,
-    NerfOptions,
-    grey_range,
-    read_nerf_synthetic,
-    read_png,
-    write_nerf_synthetic,
-    write_png,
-)
 from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.io.objects import read_object, write_object
-from holosplat.io.r2_gaussian import R2Options, read_r2_gaussian, write_r2_gaussian
 from holosplat.io.volumes import read_volume, write_volume
 from holosplat.io.vtk import read_meshes, write_mesh
 from holosplat.matter import Matter
@@ -38,6 +28,16 @@ from holosplat.representations import GaussianCloud, Stored, SurfaceMesh, VoxelG
 from holosplat.scan import Scan
 from holosplat.specimens.red_cells import icosphere
 from holosplat.volume import Volume
+from holosplat_bench.formats.nerf_synthetic import (
+    LEVELS,
+    NerfOptions,
+    grey_range,
+    read_nerf_synthetic,
+    read_png,
+    write_nerf_synthetic,
+    write_png,
+)
+from holosplat_bench.formats.r2_gaussian import R2Options, read_r2_gaussian, write_r2_gaussian
 
 FEW = settings(max_examples=20)
 """For formats of many files."""

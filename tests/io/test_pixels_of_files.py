@@ -10,12 +10,12 @@ from holosplat.checks import InputError
 from holosplat.geometry import Views, rotation_y
 from holosplat.io.beams import Beams, read_beams, write_beams
 from holosplat.io.images import read_tiff, write_tiff
-from holosplat.io.nerf_synthetic import write_nerf_synthetic
 from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.io.phase_maps import PhaseMaps, write_phase_maps
-from holosplat.io.r2_gaussian import write_r2_gaussian
 from holosplat.scan import Exposures, Scan
 from holosplat.workflows.provenance import scan_hash
+from holosplat_bench.formats.nerf_synthetic import write_nerf_synthetic
+from holosplat_bench.formats.r2_gaussian import write_r2_gaussian
 
 SIZES, SHAPE = 3.2e-6 * np.array([1.0, 1.5, 0.7]), (4, 5)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -14,12 +14,9 @@ from ..baselines.retrieve import Retrieved
 from ..baselines.retrieve import retrieve as act
 from ..checks import InputError, require
 from ..io.atomic import atomic_path
-from ..io.formats import HDF5_SUFFIXES, ScanFormat, loader_of, read_as, read_frames, read_volume_file
-from ..io.images import TiffLayout, write_tiff
-from ..io.nerf_synthetic import NerfOptions, PngKind, grey_range, write_nerf_synthetic
-from ..io.nxtomo import write_scan
+from ..io.formats import HDF5_SUFFIXES, WRITERS, loader_of, read_as, read_frames
+from ..io.images import TiffLayout
 from ..io.phase_maps import PhaseMaps, is_file, write_phase_maps
-from ..io.r2_gaussian import R2Options, write_r2_gaussian
 from ..io.reading import Reading
 from ..matter import DeltaBeta, KnownRatio, MaterialPrior
 from ..methods.method import STAND_IN_RATIO, shows_no_refraction
@@ -39,7 +36,7 @@ from .sentence import say
 class WritingOptions:
     """How it is written."""
 
-    png: PngKind | None = None
+    png: Literal["grey16", "rgba8"] | None = None
     """nerf-synthetic: 16-bit grey images (default), or the 8-bit RGBA that some programs insist on."""
     camera_distance: Positive | None = None
     """nerf-synthetic: cameras' distance, in half fields of view (default 100); the farther, the more parallel."""
@@ -78,15 +75,6 @@ class EveningOptions:
         return found
 
 
-GOES_WITH: dict[str, tuple[ScanFormat, ...]] = {
-    "png": ("nerf-synthetic",),
-    "camera_distance": ("nerf-synthetic",),
-    "tiff": ("tiff",),
-    "truth": ("r2-gaussian",),
-    "seed_points": ("nerf-synthetic", "r2-gaussian"),
-    "material": ("nerf-synthetic", "r2-gaussian"),
-}
-"""The formats that know an option."""
 NXTOMO = ".nxs"
 
 
@@ -94,7 +82,7 @@ def convert(
     source: Annotated[Positional[Path], arg(metavar="SOURCE")],
     out: Annotated[Positional[Output], arg(metavar="OUT")],
     writing: WritingOptions,
-    to: ScanFormat | None = None,
+    to: str | None = None,
     reading: Reading = Reading(),
     matter: PriorOptions = PriorOptions(),
     evening: EveningOptions = EveningOptions(),
@@ -104,44 +92,33 @@ def convert(
     Args:
         source: Scan, a file (NXtomo) or folder (nerf-synthetic, tiff, r2-gaussian, a run's).
         out: File (nxtomo) or folder to make.
-        to: Format to write (nxtomo where OUT ends with .nxs, .h5 or .hdf5); r2-gaussian needs a
-            material or δ/β, for which its line integrals are retrieved.
+        to: Format to write: nxtomo (where OUT ends with .nxs, .h5 or .hdf5), tiff, nerf-synthetic or r2-gaussian, which
+            needs a material or δ/β, for which its line integrals are retrieved.
     """
     if to is None:
         named = out.suffix.lower() in (NXTOMO, *HDF5_SUFFIXES)
         require(named, f"--to is required, for {out.name} says no format by its suffix ({NXTOMO} is nxtomo); add it.")
         to = "nxtomo"
-    said = {name: value for name, value in vars(writing).items() if value is not None}
+    require(to in WRITERS, f"--to must be one of {', '.join(WRITERS)}, but it is {to!r}.")
+    writer, said = WRITERS[to], {name: value for name, value in vars(writing).items() if value is not None}
     for name in said:
-        require(to in GOES_WITH[name], f"{flag(name)} goes with --to {' or '.join(GOES_WITH[name])}.")
+        having = " or ".join(other for other, each in WRITERS.items() if name in each.takes)
+        require(name in writer.takes, f"{flag(name)} goes with --to {having}.")
     require(
         reading.told.wall is None, "--wall is part of models and changes no frames; give it to reconstruct instead."
     )
     scan = read_as(source, reading, joined=False)
-    if loader_of(source).name == "r2-gaussian":
-        say(f"{source} has no phase: transmission exp(-p) in contact, where a density of 1 has beta "
-             f"{scan.provenance['beta_of_density_1']}; reconstruct it with --delta-beta 1, and read beta")  # fmt: skip
+    if remark := loader_of(source).remark(source, scan):
+        say(remark)
     prior = matter.prior(scan.exposures.reference_energy)
-    wanted = evening.still_light is not None or to in GOES_WITH["material"]
+    takes_material = "material" in writer.takes
+    wanted = evening.still_light is not None or takes_material
     require(not prior.fixes_ratio or wanted, f"a material is not needed with --to {to}; leave it.")
     require(len(prior.materials) < 2, f"--to {to} takes one material; give --material once.")
     scan = evening.applied(scan, prior)
-    if to == "nxtomo":
-        require(not out.is_dir(), f"{out} must be a file to write, but it is a folder; add a file name.")
-        write_scan(out, scan)
-    elif to == "tiff":
-        write_tiff(out, scan, writing.tiff or "stack")
-    elif to == "nerf-synthetic":
-        thickness = _retrieved(scan, prior)[0] if prior.fixes_ratio else None
-        write_nerf_synthetic(out, scan, replace(NerfOptions(), **said), thickness)
-        (low, high), held_out = grey_range(scan), scan.frames[scan.is_test]
-        if cut := int(((held_out < low) | (held_out > high)).sum()):
-            say(f"{cut} of {held_out.size} held-out pixels lie beyond the training frames' range and were cut off")
-    else:
-        require(prior.fixes_ratio, "--to r2-gaussian needs --material or --delta-beta: it takes retrieved thickness.")
-        if writing.truth:
-            said["truth"] = read_volume_file(writing.truth)
-        write_r2_gaussian(out, scan, *_retrieved(scan, prior), replace(R2Options(), **said))
+    retrieved = partial(_retrieved, scan, prior) if takes_material and prior.fixes_ratio else None
+    if warning := writer.write(out, scan, said, retrieved):
+        say(warning)
     say(f"wrote {out}: {to}, {len(scan)} frames of {scan.views.shape[0]} × {scan.views.shape[1]} pixels, "
          f"{int(scan.is_test.sum())} of them held out")  # fmt: skip
 

@@ -19,18 +19,19 @@ import numpy as np
 from ..checks import InputError, finite, in_range, require
 from ..geometry import Grid
 from ..matter import DeltaBeta
+from ..plugins import Extended
 from ..progress import Advance
 from ..ranges import Small, checked_dataclass
 from ..scan import Scan
 from ..volume import Object, Volume
-from . import arrays, euxfel, images, nerf_synthetic, nxtomo, r2_gaussian
+from . import arrays, euxfel, images, nxtomo
 from .angles import in_order
 from .hdf5 import open_hdf5
 from .hdf5_guard import is_vouched
 from .ome import TIFF_SUFFIXES, ZARR_SUFFIX, read_ome_tiff, read_ome_zarr, require_zarr, write_ome_tiff, write_ome_zarr
 from .paraview import read_vti, write_vti
 from .plain_values import both, read_both, read_mrc, read_nrrd, write_mrc, write_nrrd
-from .raw_file import Loader, ScanFile, folder_with
+from .raw_file import Loader, Retrieved, ScanFile, Writer, folder_with
 from .reading import Reading
 from .stacks import all_images
 from .stored_frames import Mended, with_fields
@@ -84,9 +85,6 @@ def read_marks(path: Path, names: Sequence[str]) -> dict[str, str]:
         return {name: str(file.attrs[name]) for name in names if name in file.attrs}
 
 
-ScanFormat = Literal["nxtomo", "nerf-synthetic", "tiff", "r2-gaussian"]
-"""Formats that scans are written in."""
-
 LOADERS: tuple[Loader, ...] = (
     nxtomo.LOADER,
     arrays.EXCHANGE,
@@ -95,18 +93,35 @@ LOADERS: tuple[Loader, ...] = (
     images.LOADER,
     images.NIKON,
     euxfel.LOADER,
-    nerf_synthetic.LOADER,
-    r2_gaussian.LOADER,
     Loader(
         *("run", f"a run folder, with config.json and {SOURCE}", folder_with("config.json", SOURCE)),
         lambda path, given: read_run_scan(path),
     ),
 )
-"""Every format that scans are read from; a new one is a file and a line here (docs/adding.md)."""
+"""Every format of ours that scans are read from; a new one is a file and a line here (docs/adding.md)."""
+ADDED: Extended[Loader] = Extended({}, "holosplat.loaders")
+"""Those of other packages, by name."""
+
+
+def _write_nxtomo(out: Path, scan: Scan, options: Mapping[str, Any], retrieved: Retrieved | None) -> str:
+    require(not out.is_dir(), f"{out} must be a file to write, but it is a folder; add a file name.")
+    nxtomo.write_scan(out, scan)
+    return ""
+
+
+def _write_tiff_scan(out: Path, scan: Scan, options: Mapping[str, Any], retrieved: Retrieved | None) -> str:
+    images.write_tiff(out, scan, options.get("tiff", "stack"))
+    return ""
+
+
+WRITERS: Extended[Writer] = Extended(
+    {"nxtomo": Writer(_write_nxtomo), "tiff": Writer(_write_tiff_scan, ("tiff",))}, "holosplat.writers"
+)
+"""Every format that scans are written in, by name; other packages add theirs (docs/adding.md)."""
 
 
 def read(path: str | Path, given: Mapping[str, Any] | None = None) -> Scan:
-    """Read the scan at `path`, a file or folder of any format in `LOADERS`.
+    """Read the scan at `path`, a file or folder of any format in `LOADERS` or `ADDED`.
 
     given: values that files lack, or that replace theirs, by name (`Loader.takes`): energy_kev [keV], distance [m],
     pixel_size [m], angles_deg [N], and the others of `Loader.takes`.
@@ -174,14 +189,15 @@ def loader_of(path: str | Path) -> Loader:
     """The loader of `path`; `InputError` if none or more than one recognises it."""
     found = Path(path)
     require(found.exists(), f"{path} must be a scan, but there is no such file or folder; check the path.")
-    loaders = [loader for loader in LOADERS if loader.recognises(found)]
+    every = (*LOADERS, *ADDED.values())
+    loaders = [loader for loader in every if loader.recognises(found)]
     loaders = [loader for loader in loaders if not loader.is_general] or loaders
     if len(loaders) == 1:
         return loaders[0]
     if loaders:
         kinds = " and ".join(loader.name for loader in loaders)
         raise InputError(f"{path} must be a scan of one format, but it is ambiguous: {kinds}; keep the files of one.")
-    known = "; ".join(f"{loader.mark} ({loader.name})" for loader in LOADERS)
+    known = "; ".join(f"{loader.mark} ({loader.name})" for loader in every)
     raise InputError(f"{path} must be a scan, but it {_content(found)}, which is none of what is known: {known}.")
 
 

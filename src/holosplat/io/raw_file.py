@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -305,6 +305,7 @@ class Loader:
         paths of images; files, the names of images in a folder; entry, of an HDF5 file; black, white).
     opens: opens such a file frame by frame, raw ones with their flats and darks; None where frames are corrected.
     is_general: whether it takes what none of the others recognises.
+    remark: a sentence for whoever converts such a scan; empty: none.
     """
 
     name: str
@@ -314,6 +315,19 @@ class Loader:
     takes: tuple[str, ...] = ()
     opens: Opens | None = None
     is_general: bool = False
+    remark: Callable[[Path, Scan], str] = lambda path, scan: ""
+
+
+Retrieved = Callable[[], tuple[np.ndarray, float]]
+"""Retrieves the thickness [N, H, W] [m] of the material that is told in the frames of a scan, and its δ."""
+
+
+class Writer(NamedTuple):
+    """A format that scans are written in. write: a scan to a path, by options, and with what is retrieved of a
+    material (None: none is told); a warning, or an empty text; takes: names of the options, and `material`."""
+
+    write: Callable[[Path, Scan, Mapping[str, Any], Retrieved | None], str]
+    takes: tuple[str, ...] = ()
 
 
 def folder_with(*names: str) -> Callable[[Path], bool]:

@@ -10,11 +10,11 @@ import numpy as np
 
 from holosplat.checks import require
 from holosplat.io.atomic import atomic_folder, write_json
-from holosplat.io.nerf_synthetic import camera_poses, write_nerf_synthetic
-from holosplat.io.r2_gaussian import R2Options, write_r2_gaussian
 from holosplat.progress import Advance
 from holosplat.units import wavenumber
 
+from ..formats.nerf_synthetic import camera_poses, write_nerf_synthetic
+from ..formats.r2_gaussian import R2Options, write_r2_gaussian
 from .folder import Dataset
 from .sample import SampleScan, as_scan
 

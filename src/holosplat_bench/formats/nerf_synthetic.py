@@ -9,19 +9,19 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from PIL import Image
 
-from ..checks import InputError, in_range, require, shaped
-from ..geometry import Grid, Views
-from ..ranges import Metres, Natural, Positive, Signed, Small, Within, checked_dataclass
-from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, Scan, checked_distance
-from .atomic import atomic_folder, write_json
-from .guard import undamaged
-from .raw_file import Loader, folder_with, require_said
-from .table import Table, beam_table, exposure_table, read_own_exposures
+from holosplat.checks import InputError, in_range, require, shaped
+from holosplat.geometry import Grid, Views
+from holosplat.io.atomic import atomic_folder, write_json
+from holosplat.io.guard import undamaged
+from holosplat.io.raw_file import Loader, Retrieved, Writer, folder_with, require_said
+from holosplat.io.table import Table, beam_table, exposure_table, read_own_exposures
+from holosplat.ranges import Metres, Natural, Positive, Signed, Small, Within, checked_dataclass
+from holosplat.scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, Scan, checked_distance
 
 FINEST = 64
 """Voxels along the longer side of the field of view in which a hull is looked for."""
@@ -177,7 +177,7 @@ def write_nerf_synthetic(
     a copy of the test's: most readers ask for one. Errors: `InputError` for views of several pixel sizes, since one
     angle of view serves all cameras.
     """
-    from .solids import write_ply  # needs torch, which takes longer than all else
+    from holosplat.io.solids import write_ply  # needs torch, which takes longer than all else
 
     _ = scan.views.pixel_size
     views, train = scan.views, np.flatnonzero(~scan.is_test)
@@ -301,3 +301,15 @@ def _read(path: Path, given: Mapping[str, float]) -> Scan:
 
 
 LOADER = Loader("nerf-synthetic", f"a folder with {TRAIN}", folder_with(TRAIN), _read, TAKES)
+
+
+def _convert(out: Path, scan: Scan, options: Mapping[str, Any], retrieved: Retrieved | None) -> str:
+    write_nerf_synthetic(out, scan, NerfOptions(**options), None if retrieved is None else retrieved()[0])
+    (low, high), held_out = grey_range(scan), scan.frames[scan.is_test]
+    cut = int(((held_out < low) | (held_out > high)).sum())
+    if not cut:
+        return ""
+    return f"{cut} of {held_out.size} held-out pixels lie beyond the training frames' range and were cut off"
+
+
+WRITER = Writer(_convert, ("png", "camera_distance", "seed_points", "material"))

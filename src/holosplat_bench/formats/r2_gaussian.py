@@ -8,23 +8,26 @@ them.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..checks import InputError, finite, in_range, positive, require, shaped
-from ..geometry import Grid, Views
-from ..ranges import Natural, checked_dataclass
-from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, Scan
-from ..units import wavenumber
-from ..volume import Volume
-from .atomic import atomic_folder, write_json
-from .guard import read_array
+from holosplat.checks import InputError, finite, in_range, positive, require, shaped
+from holosplat.geometry import Grid, Views
+from holosplat.io.atomic import atomic_folder, write_json
+from holosplat.io.formats import read_volume_file
+from holosplat.io.guard import read_array
+from holosplat.io.raw_file import Loader, Retrieved, Writer, folder_with, require_said
+from holosplat.io.table import Table, beam_table, exposure_table, read_own_exposures
+from holosplat.ranges import Natural, checked_dataclass
+from holosplat.scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, Scan
+from holosplat.units import wavenumber
+from holosplat.volume import Volume
+
 from .nerf_synthetic import hull_points
-from .raw_file import Loader, folder_with, require_said
-from .table import Table, beam_table, exposure_table, read_own_exposures
 
 FORMAT = "holosplat R2-Gaussian 1"
 META = "meta_data.json"
@@ -253,7 +256,27 @@ def _absorber(
 TAKES = ("energy_kev", "pixel_size")
 
 
+def _remark(path: Path, scan: Scan) -> str:
+    return (
+        f"{path} has no phase: transmission exp(-p) in contact, where a density of 1 has beta "
+        f"{scan.provenance['beta_of_density_1']}; reconstruct it with --delta-beta 1, and read beta"
+    )
+
+
 LOADER = Loader(
     *("r2-gaussian", f"a folder with {META}", folder_with(META)),
     *(lambda path, given: read_r2_gaussian(path, *(given.get(name) for name in TAKES)), TAKES),
+    remark=_remark,
 )
+
+
+def _convert(out: Path, scan: Scan, options: Mapping[str, Any], retrieved: Retrieved | None) -> str:
+    if retrieved is None:
+        raise InputError("--to r2-gaussian needs --material or --delta-beta: it takes retrieved thickness.")
+    truth = options.get("truth")
+    how = R2Options(**{**options, "truth": None if truth is None else read_volume_file(truth)})
+    write_r2_gaussian(out, scan, *retrieved(), how)
+    return ""
+
+
+WRITER = Writer(_convert, ("truth", "seed_points", "material"))

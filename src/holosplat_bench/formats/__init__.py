@@ -1,0 +1,1 @@
+"""Layouts of other programs of splats and radiance fields: scans from and to them."""
