@@ -5,11 +5,11 @@
 Four views evenly over 180° of 64 × 64 pixels of 0.5 µm, 20 keV, 10 cm, known material, 1000 photons a pixel, 12 times
 over one second, of which the first 8 are reconstructed. stir4: the stirred soft blob of `moving_matter.py`, whose
 middle turns by 60°: its vortices are steady. drift4: such a blob of 0.6 times the size that drifts by 6 µm in any
-direction, through fluid at rest. Errors are those of δ of the whole volume at a time ahead, ‖δ - δ₀‖ / ‖δ₀‖; places: rms
-distance along an axis, by mass, of Gaussians from where the true motion takes what they stand for, since the reference
-time and since the last one; band: the standard error that is stated. `still` is the last volume without change, `auto`
-what the last third of the run's times decides. Seeds below 100 are for development. Rows that are there are not made
-again.
+direction, through fluid at rest. Errors are those of δ of the whole volume at a time ahead, ‖δ - δ₀‖ / ‖δ₀‖.
+places: rms distance along an axis, by mass, of Gaussians from where the true motion takes what they stand for, since
+the reference time and since the last one; band: the standard error that is stated. `still` is the last volume without
+change, `auto` what the last third of the run's times decides. Seeds below 100 are for development. Rows that are there
+are not made again.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def scene(case: str, seed: int) -> CarriedScene:
         return hs.specimens.stirred_blob(SIZE, MATERIAL, seed, turn=np.radians(60))
     way = np.random.default_rng(seed).normal(size=3)
     still = hs.specimens.stirred_blob(0.6 * SIZE, MATERIAL, seed)
-    return replace(still, motion=Drift(DRIFT * way / np.linalg.norm(way)))
+    return replace(still, motion=Drift(DRIFT * way / np.linalg.norm(way)), reach=still.reach + DRIFT)
 
 
 def run(case: str, seed: int) -> list[Row]:
