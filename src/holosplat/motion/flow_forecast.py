@@ -2,8 +2,8 @@
 each keeps its volume and its amplitude.
 
 A flow goes on in one of three ways. Slow fluid between walls keeps the velocity of each place (`steady`). Where inertia
-rules, matter keeps its velocity as far as the flow stays free of divergence (`inertia`: Euler's equations by particles
-and projection; Chorin 1968, Math. Comput. 22, 745). Or the fitted change of the flow goes on (`paths`).
+rules, fluid keeps its velocity as far as the flow stays free of divergence (`inertia`: Euler's equations by projection;
+Chorin 1968, Math. Comput. 22, 745). Or the fitted change of the flow goes on (`paths`).
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Literal
 
 import numpy as np
@@ -20,7 +20,7 @@ from torch import Tensor
 
 from ..baselines.tomography import plateau
 from ..checks import require
-from ..fit.flow_volume import FlowProblem, likelier_flow, minimised, strain
+from ..fit.flow_volume import FlowProblem, likelier_flow, minimised
 from ..fit.smooth_volume import ContinuousPrior
 from ..geometry import Grid
 from ..inference import Decision, Score, select
@@ -28,7 +28,7 @@ from ..matter import MaterialPrior
 from ..methods import Task
 from ..optics.background import LightOptions
 from ..progress import Progress
-from ..representations import Flow, GaussianCloud, MovingGaussians, TimeBasis
+from ..representations import Flow, GaussianCloud, Lattice, MovingGaussians, TimeBasis
 from ..scan import Scan
 from .flow_reconstruction import FEWEST_PIXELS, FlowOptions
 from .forecast import early_count
@@ -39,9 +39,7 @@ STEADY, INERTIA, PATHS = "steady", "inertia", "paths"
 FEWEST = 4
 """Times of which halves tell a flow."""
 NAME, BY = "how matter goes on", "frames of the last third of the run's times"
-STIFF = 1e-3
-"""Weight of the strain of a change of flow beside the misfit of velocities: it fills places without matter."""
-PROJECTION = 40
+PROJECTION, FROM_REST = 20, 40
 """Iterations of a projection, and of a fit from rest: more change neither."""
 
 Render = Callable[[MovingGaussians, Scan], Tensor]
@@ -77,7 +75,7 @@ def gone_on(matter: MovingGaussians, last: float, ahead: np.ndarray, way: Way) -
     else:
         basis = TimeBasis(last, float(ahead[-1]), 1, len(ahead))
         nodes = [last, *ahead.tolist()]
-        fields = _inertial(old, cloud, nodes) if way == INERTIA else [_at(old, time) for time in nodes]
+        fields = _inertial(old, nodes) if way == INERTIA else [_at(old, time) for time in nodes]
     tensors = {name: pace * torch.stack([one[name] for one in fields]) for name in fields[0]}
     flow = Flow(tensors["potential"], old.lattice, basis, last, steps, tensors.get("sources"))
     return MovingGaussians(cloud, flow)
@@ -98,34 +96,42 @@ def _mass(cloud: GaussianCloud) -> Tensor:
     return (mass / mass.sum()).detach()
 
 
-def _inertial(flow: Flow, cloud: GaussianCloud, times: list[float]) -> list[dict[str, Tensor]]:
-    """The potentials at `times`, of which the first is that of the flow, where the Gaussians are as in `cloud`: in each
-    step they keep their velocity, and the flow changes by the least that gives them it."""
+def _inertial(flow: Flow, times: list[float]) -> list[dict[str, Tensor]]:
+    """The potentials at `times`, of which the first is that of the flow.
+
+    In each step a place gets the velocity of where its fluid came from (Stam 1999, SIGGRAPH, 121, with the midpoint
+    rule), and of flows without divergence the one next to that is taken, in the mean square over all space.
+    """
     require(flow.sources is None, "inertia needs a flow without sources, but this one has some; take --by steady.")
     constant = TimeBasis(flow.basis.first, flow.basis.last, 0)
-    found = [replace(flow, basis=constant, potential=_at(flow, times[0])["potential"][None])]
-    points, mass = cloud.centres, _mass(cloud)
+    now = replace(flow, basis=constant, potential=_at(flow, times[0])["potential"][None])
+    points, found = _between_nodes(flow.lattice).to(flow.potential), [now.potential[0]]
     for before, time in pairwise(times):
-        velocity = found[-1].velocity(points, before)
-        points = points + (time - before) / (constant.last - constant.first) * velocity
-        found.append(_with_velocities(found[-1], points, velocity, mass))
-    return [{"potential": one.potential[0]} for one in found]
+        part = (time - before) / (constant.last - constant.first)
+        halfway = points - 0.5 * part * now.velocity(points, before)
+        came_from = points - part * now.velocity(halfway, before)
+        now = _projected(now, points, now.velocity(came_from, before))
+        found.append(now.potential[0])
+    return [{"potential": one} for one in found]
 
 
-def _with_velocities(flow: Flow, points: Tensor, wanted: Tensor, mass: Tensor) -> Flow:
-    """The steady `flow` changed by the least strain such that `points` [N, 3] have the velocities `wanted` [N, 3]."""
-    with torch.no_grad():
-        missing = wanted - flow.velocity(points, flow.basis.first)
-    scale = float(missing.square().sum(1) @ mass) + 1e-30
-    leaf = torch.zeros_like(flow.potential).requires_grad_()
+def _between_nodes(lattice: Lattice) -> Tensor:
+    """[P, 3]: eight points a cell, of the cells next to the nodes."""
+    shifts = 0.25 * lattice.cell * torch.tensor(list(product((-1.0, 1.0), repeat=3)), dtype=torch.float64)
+    return (lattice.nodes()[:, None] + shifts).flatten(0, 1)
+
+
+def _projected(flow: Flow, points: Tensor, wanted: Tensor) -> Flow:
+    """The steady `flow` changed such that its velocities at `points` [N, 3] are next to those `wanted` [N, 3]."""
+    missing = wanted - flow.velocity(points, flow.basis.first)
+    scale = float(missing.square().mean()) + torch.finfo(missing.dtype).tiny
+    leaf = flow.potential.new_zeros(flow.potential.shape).requires_grad_()
     optimiser = minimised([leaf], PROJECTION)
 
     def closure() -> float:
         optimiser.zero_grad()
         change = replace(flow, potential=flow.lattice.cell * leaf)
-        left = (change.velocity(points, flow.basis.first) - missing).square().sum(1) @ mass
-        nodes = math.prod(flow.lattice.counts)
-        value = (left + STIFF * strain(change, [flow.basis.first]) / nodes) / scale
+        value = (change.velocity(points, flow.basis.first) - missing).square().mean() / scale
         value.backward()
         return float(value.detach())
 
@@ -188,7 +194,7 @@ class FlowHistory:
             degree = min(flow.basis.degree, max(len(times) - 2, 0))
             basis = TimeBasis(float(times[0]), float(times[-1]), degree)
             rest = Flow.still(flow.lattice, basis, flow.reference, flow.steps, flow.sources is not None)
-            self._early = self._fitted(rest, range(len(times)), PROJECTION)
+            self._early = self._fitted(rest, range(len(times)), FROM_REST)
         return self._early
 
     def half(self, which: int) -> MovingGaussians:
