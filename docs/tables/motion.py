@@ -160,6 +160,20 @@ def _scores(row: Row, of: bool) -> list[str]:
     ]
 
 
+@table("flow-forecast", "python benchmarks/flow_forecast.py", "20 minutes", "flow_forecast.csv")
+def matter_ahead() -> str:
+    """Matter in motion after the last frames, by each way."""
+    named = {"stir4": "stirred", "drift4": "drifting"}
+    rows = {(row["case"], int(row["ahead"]), row["way"]): row for row in read("flow_forecast.csv")}
+    lines = []
+    for case, ahead in sorted({key[:2] for key in rows}, reverse=True):
+        ways = [rows[case, ahead, way] for way in ("still", "steady", "inertia", "auto")]
+        errors, places = ([rounded(row[name], 3) for row in ways] for name in ("error", "places_since"))
+        lines.append([named[case], str(ahead), *errors, f"{places[-1]} µm", f"{rounded(ways[-1]['band'], 3)} µm"])
+    head = ("matter", "times ahead", "no change", "steady", "inertia", "auto", "places, auto", "stated")
+    return markdown(head, lines)
+
+
 # --- forecasts ----------------------------------------------------------------------------------------------
 
 

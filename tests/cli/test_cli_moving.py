@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from helpers.cli import holosplat, worked
+from holosplat.cli import forecast as forecasting
 from holosplat.cli import scans
 from holosplat.cli import track as motion
 from holosplat.fit.run import Run
@@ -133,6 +134,41 @@ def test_two_materials_in_motion_are_refused_or_said_to_be_left(quick, capsys):
     assert "a flow carries one material, but several are known" in said
     assert "nothing moves" not in said
     assert not (quick / "none").exists()
+
+
+def test_matter_in_motion_is_forecast(quick, monkeypatch):
+    """Judged by the frames after the run, with an error of its places; the folder is read as any other."""
+    blob = ["--specimen", "stirred-blob", "--material", "PMMA", "--specimen-motion", 40, "--frame-rate", 1e3]
+    field = ["--frames", 6, "--detector", 15, 19, "--pixel-size", "1e-6", "--distance", 0.1, "--views", 3]
+    scan, run, later = quick / "six.nxs", quick / "run", quick / "later"
+    worked(holosplat("simulate", *blob, *field, "--photons-per-pixel", 2000, "--test-every", 0, "--out", scan))
+    known = ["--material", "PMMA", "--motion", "flow", "--time-frames", "0:4"]
+    worked(holosplat("reconstruct", scan, *known, "--out", run))
+    monkeypatch.setattr(forecasting, "report_run", lambda folder, *_: folder.report)
+    said = worked(holosplat("forecast", run, "--times", 2, "--out", later))
+    assert "standard error of places: 0." in said.out
+    assert "how matter goes on: " in said.out
+    assert "held-out frames: SSIM" in said.out
+    numbers = json.loads((later / "forecast.json").read_text())
+    assert numbers["times_s"] == pytest.approx([4e-3, 5e-3])
+    assert [row["time_s"] for row in numbers["held_out"]] == pytest.approx([4e-3, 5e-3])
+    assert [float(row["standard_error_m"]) for row in read_rows(later / "forecast.csv", "")] == pytest.approx(
+        numbers["band_m"], rel=1e-3
+    )
+    found = load_reconstruction(RunFolder(later)).object
+    assert isinstance(found, MovingGaussians)
+    assert (found.basis.first, found.basis.last) == pytest.approx((3e-3, 5e-3))
+    worked(holosplat("export", later, "--volume", quick / "v.h5", "--time-frame", 1))
+    assert read_volume(quick / "v.h5").delta.max() > 0
+    chosen = worked(holosplat("forecast", run, "--times", 1, "--by", "inertia", "--no-half-sets", "--out", quick / "i"))
+    assert "standard error of places: not told" in chosen.out
+    for way, why in (("rigid", "--by must be auto, steady, inertia or paths"), ("graph", "--by must be auto, steady")):
+        refused = holosplat("forecast", run, "--times", 1, "--by", way, "--out", quick / "none")
+        assert refused.code == 2
+        assert why in refused.err
+        assert not (quick / "none").exists()
+    refused = holosplat("track", scan, "--material", "PMMA", "--after", later, "--out", quick / "none")
+    assert refused.code == 2
 
 
 FEW = ["volume.iterations=5", "volume.retrieval=5", "volume.corrections=0", "fit.flow_steps=3", "fit.schedule.steps=3"]

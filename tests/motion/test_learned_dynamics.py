@@ -39,7 +39,7 @@ from holosplat.motion.learned import (
 )
 from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.specimens.red_cells import icosphere
-from holosplat.workflows.forecast import ForecastOptions, _others, require_cells
+from holosplat.workflows.forecast import ForecastOptions, _others, require_way
 from holosplat_bench.training.dynamics import DynamicsTraining, FlowSeries, _noise, draw_lesson, train_dynamics
 from holosplat_bench.training.options import TrainOptions
 
@@ -211,7 +211,7 @@ def test_what_cannot_be_foretold_is_refused(untrained, tmp_path):
     run = SimpleNamespace(object=straight())
     options = ForecastOptions(learned=GraphForecast(str(tmp_path / "other.safetensors")), decides=True)
     with pytest.raises(InputError, match="must be a safetensors file"):
-        require_cells(run, TIMES, options)  # type: ignore[arg-type]
+        require_way(run, TIMES, options)  # type: ignore[arg-type]
 
 
 def test_a_network_that_cannot_look_so_far_is_left_out_and_said_to_be(untrained):

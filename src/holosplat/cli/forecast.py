@@ -1,4 +1,4 @@
-"""`holosplat forecast`: the bodies of a run of track, and their frames, at later times."""
+"""`holosplat forecast`: the bodies of a run of track, or matter in motion, and their frames at later times."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from ..io.reading import Reading, Told, ends_of
 from ..motion.cell_model import ChannelFrame
 from ..motion.dynamics import DynamicsForecast
 from ..motion.fit import MotionFit
+from ..motion.flow_forecast import Way
 from ..motion.forecast import FORECASTERS, SAME_TIME, Forecaster, PathForecast
 from ..motion.learned import GraphForecast
 from ..planning.acts import of_forecast
@@ -29,8 +30,7 @@ from ..workflows.forecast import (
     Forecasted,
     ForecastOptions,
     config_of,
-    require_cells,
-    tracked_bodies,
+    require_way,
     write_forecast,
 )
 from ..workflows.forecast import forecast as carry_on
@@ -44,7 +44,9 @@ from .places import Output
 from .progress import ProgressBar
 from .sentence import interruptible, put, say, tell
 
-OWN = ("auto", "paths", "rigid", "mechanics", "assimilate", "graph", "hybrid")
+FLOWING: tuple[Way, ...] = ("steady", "inertia")
+"""Ways of matter that a flow carries."""
+OWN = ("auto", "paths", "rigid", "mechanics", "assimilate", "graph", "hybrid", *FLOWING)
 """Ways of --by; other packages add theirs."""
 MECHANICAL = ("auto", "mechanics", "hybrid", "assimilate")
 OF_CHANNEL = ("flow_axis", "channel_centre", "peak", "shear_modulus", "viscosity", "back")
@@ -66,7 +68,9 @@ class ForecastFlags:
     flow of --channel, which their paths over the last times tell; assimilate: the same, fitted to the frames of these
     times (4D-Var); graph: a network that learnt from red cells in flow; hybrid: the mean of mechanics and the network
     by their errors; dmd, sindy: modes of each body's own past; auto: paths, unless the network, or with a channel the
-    hybrid, tells the last third of the times better."""
+    hybrid, tells the last third of the times better. Matter of reconstruct --motion flow goes on by steady, the
+    velocity of each place as at the last time; by inertia, each part with its velocity as far as volumes are kept; or
+    by paths, the fitted change of the flow; auto: whichever tells the last third of the times best."""
     weights: str = ""
     """File of the network's weights, as train --network dynamics writes it (default: those of the package)."""
     degree: int = 2
@@ -109,8 +113,9 @@ class ForecastFlags:
         step = 0.0 if self.step is None else positive("--step", self.step, "seconds")
         model = PathForecast(self.degree, self.window, self.by == "rigid", self.keep_volume)
         learned, decides = self._learned(), self.by == "auto"
+        flow: Way | None = next((way for way in FLOWING if way == self.by), None)
         return ForecastOptions(
-            self.times, step, model, self._dynamics(model), learned, decides, self.half_sets, self.effort
+            self.times, step, model, self._dynamics(model), learned, decides, self.half_sets, self.effort, flow
         )
 
     def _learned(self) -> Forecaster | None:
@@ -150,15 +155,15 @@ def forecast(
     resume: bool = False,
     allow_external: bool = False,
 ) -> None:
-    """Carry a run of track on: its bodies and their frames at later times, with a standard error.
+    """Carry a run of track, or of reconstruct --motion flow, on: its bodies or its matter, and their frames, at later
+    times, with a standard error.
 
-    Frames of the scan after the run's last time (track --time-frames) judge the forecast, and are used for nothing
-    else.
+    Frames of the scan after the run's last time (--time-frames) judge the forecast, and are used for nothing else.
 
     Args:
-        run: Run folder of track.
+        run: Run folder of track, or of reconstruct --motion flow.
         out: Run folder to make: what track writes, at the times ahead; forecast.nxs, the predicted frames;
-            forecast.csv, the standard error of each body's surface; forecast.json.
+            forecast.csv, the standard error of each body's surface, or of the places of matter; forecast.json.
         seed: Seed of the fits to half-sets.
         resume: Go on with an interrupted forecast; --resume RUN alone, with its run and options.
         allow_external: Follow links of the run's scan to other files; only of files you trust.
@@ -166,9 +171,8 @@ def forecast(
     Told(allow_external=allow_external).vouch(run)
     options, folder, new = how.options(), RunFolder(run), RunFolder(out)
     tracked = load_reconstruction(folder)
-    tracked_bodies(tracked)
     times = np.array(instants_of(folder))
-    require_cells(tracked, times, options)
+    require_way(tracked, times, options)
     own = run_reading(folder.path)  # of all times of the scan, later ones too, where the run found the geometry to be
     reading = replace(own, part=replace(own.part, time_frame=None, time_frames=None))
     scan = where_found(folder, read_frames(folder.source_scan(), reading).in_memory())
@@ -189,7 +193,8 @@ def forecast(
         final = reconstruction_at(done, found.forecast.times.tolist(), last)
         ahead = f"This is a forecast of the time {1e6 * found.forecast.times[last]:.4g} µs, the last of {last + 1}."
         say(f"report: {report_run(new, final, shown, evaluate(final, shown, None), None, ahead)}")
-    say(f"wrote {out / COLLECTION}, {out / TRACKS}, {out / FRAMES}, {out / TABLE}")
+    written = (COLLECTION, TRACKS, FRAMES, TABLE) if (out / TRACKS).is_file() else (FRAMES, TABLE)
+    say("wrote " + ", ".join(str(out / name) for name in written))
 
 
 def _source(folder: RunFolder, scan: Scan, found: Forecasted, out: Path) -> dict[str, object]:
@@ -205,6 +210,6 @@ def _source(folder: RunFolder, scan: Scan, found: Forecasted, out: Path) -> dict
 def _shown(scan: Scan, found: Forecasted) -> Scan:
     """What the report shows of the last time: frames that the run did not see, or else those that are predicted."""
     last = found.forecast.times[-1]
-    slack = SAME_TIME * (last - found.forecast.bodies.basis.first)
+    slack = SAME_TIME * (last - found.forecast.object.basis.first)
     held_out = scan[np.flatnonzero(np.abs(scan.exposures.time - last) <= slack)]
     return held_out if len(held_out) else found.predicted[np.flatnonzero(found.predicted.exposures.time == last)]

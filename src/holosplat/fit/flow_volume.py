@@ -171,7 +171,8 @@ def strain(flow: Flow, times: Sequence[float]) -> Tensor:
     return (0.5 * (gradients + gradients.mT)).square().sum() / len(times)
 
 
-def _minimised(tensors: list[Tensor], iterations: int) -> torch.optim.LBFGS:
+def minimised(tensors: list[Tensor], iterations: int) -> torch.optim.LBFGS:
+    """L-BFGS that changes `tensors` in so many iterations of one call of `step`."""
     return torch.optim.LBFGS(
         tensors,
         lr=1.0,
@@ -192,7 +193,7 @@ def likelier_fading(
     spread: standard deviation expected of what logarithms of amplitudes change by over all times, at each node.
     """
     leaf = fading.coefficients.detach().clone().requires_grad_()
-    optimiser, values = _minimised([leaf], iterations), list[float]()
+    optimiser, values = minimised([leaf], iterations), list[float]()
 
     def closure() -> float:
         optimiser.zero_grad()
@@ -221,7 +222,7 @@ def likelier_flow(
     leaves = {name: tensor.detach().clone().requires_grad_() for name, tensor in flow.parameters().items()}
     times = torch.linspace(flow.basis.first, flow.basis.last, flow.basis.count).tolist()
     scale = float(flow.lattice.cell)
-    optimiser = _minimised(list(leaves.values()), iterations)
+    optimiser = minimised(list(leaves.values()), iterations)
     values: list[float] = []
 
     def closure() -> float:

@@ -72,6 +72,11 @@ class Forecast:
     told: dict[str, float] = field(default_factory=dict)
     rest: Rest | None = None
 
+    @property
+    def object(self) -> MovingSurfaces:
+        """The bodies."""
+        return self.bodies
+
     def usual_band(self) -> np.ndarray:
         """[N] m, the median over bodies."""
         return np.sqrt(np.median(self.band**2, axis=1))

@@ -1,8 +1,9 @@
-"""`forecast`: a run of `track` in, its bodies and their holograms at later times out, with a band."""
+"""`forecast`: a run of `track`, or of matter in motion, in; it and its holograms at later times out, with a band."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -19,13 +20,14 @@ from ..methods.presets import SCHEMA
 from ..metrics import image_scores, intensity_range
 from ..motion.assimilate import carry_by_frames
 from ..motion.dynamics import DynamicsForecast, HybridForecast, window_of
+from ..motion.flow_forecast import PATHS, FlowForecast, FlowHistory, Way, forecast_matter
 from ..motion.forecast import SAME_TIME, Forecast, Forecaster, Halves, History, PathForecast, decided
 from ..motion.learned import GraphForecast, read_dynamics
 from ..motion.measures import early_part, half_fit, half_sets
 from ..optics.background import Light
 from ..progress import FitProgress
 from ..ranges import Many, Positive, Seconds, checked_dataclass
-from ..representations import MovingSurfaces
+from ..representations import MovingGaussians, MovingSurfaces
 from ..scan import Scan
 from ..tables import read_rows, to_table
 from .evaluate import render_object
@@ -65,6 +67,8 @@ class ForecastOptions:
     """Whether paths are fitted again to two halves of the times, which say what is believed of the motion."""
     effort: Positive = 1.0
     """Factor of the numbers of steps of these fits."""
+    flow: Way | None = None
+    """How matter in motion goes on (default: the way that tells the last third of the times best)."""
 
     def __post_init__(self) -> None:
         require(
@@ -87,10 +91,10 @@ class ForecastOptions:
 
 @dataclass(frozen=True)
 class Forecasted:
-    """What `forecast` found. forecast: bodies and band; predicted: the frames at its times; judged: scores against the
-    frames that the run did not see, a row a time, empty without such frames; decision: between paths and other ways."""
+    """What `forecast` found. forecast: bodies, or matter, and band; predicted: the frames at its times; judged: scores
+    against the frames that the run did not see, a row a time, empty without such frames; decision: between ways."""
 
-    forecast: Forecast
+    forecast: Forecast | FlowForecast
     predicted: Scan
     judged: list[dict[str, float]]
     decision: Decision | None = None
@@ -98,16 +102,16 @@ class Forecasted:
     def lines(self) -> list[str]:
         """The numbers as a few lines of text."""
         step, last = self.forecast.times[0], self.forecast.times[-1]
-        band = 1e6 * self.forecast.usual_band()
+        band, of = 1e6 * self.forecast.usual_band(), "surfaces" if isinstance(self.forecast, Forecast) else "places"
         said = [
-            "standard error of surfaces: not told, for that needs half-sets, for which the run has too few times, or "
+            f"standard error of {of}: not told, for that needs half-sets, for which the run has too few times, or "
             "which --no-half-sets leaves out"
         ]
         if np.isfinite(band).all():
-            said = [f"standard error of surfaces: {band[0]:.3f} µm at {step:.4g} s, {band[-1]:.3f} µm at {last:.4g} s"]
+            said = [f"standard error of {of}: {band[0]:.3f} µm at {step:.4g} s, {band[-1]:.3f} µm at {last:.4g} s"]
         if self.decision is not None:
             said.append(self.decision.line)
-        if self.forecast.told:
+        if isinstance(self.forecast, Forecast) and self.forecast.told:
             said.append(flow_in_words(self.forecast.told))
         if self.judged:
             ends = [self.judged[0], self.judged[-1]]
@@ -127,9 +131,23 @@ def tracked_bodies(run: Reconstruction) -> MovingSurfaces:
     return run.object
 
 
-def require_cells(run: Reconstruction, times: np.ndarray, options: ForecastOptions) -> None:
-    """`InputError`, before any fit, where mechanics have no cell to carry on after the tracked `times` [T] s, and where
-    what was learnt cannot be asked, or is no network; `MissingError` without its library."""
+def require_way(run: Reconstruction, times: np.ndarray, options: ForecastOptions) -> None:
+    """`InputError`, before any fit, for a way that the run's object does not go in, where mechanics have no cell to
+    carry on after the tracked `times` [T] s, and where what was learnt cannot be asked, or is no network;
+    `MissingError` without its library."""
+    if isinstance(run.object, MovingGaussians):
+        of_bodies = options.dynamics or (options.learned and not options.decides) or options.model != PathForecast()
+        require(
+            not of_bodies,
+            "--by must be auto, steady, inertia or paths for matter in motion, but it, or an option beside it, is of "
+            "bodies; leave it.",
+        )
+        return
+    tracked_bodies(run)
+    require(
+        options.flow is None,
+        f"--by {options.flow} is of matter in motion, but this run holds bodies; take --by auto or paths.",
+    )
     if isinstance(options.learned, GraphForecast) and options.learned.weights:
         read_dynamics(Path(options.learned.weights))
     if options.dynamics is not None:
@@ -148,19 +166,51 @@ def forecast(
     journal: Journal | None = None,
     on_progress: FitProgress = lambda stage, fraction, record: None,
 ) -> Forecasted:
-    """What the bodies of `run`, tracked at `times` [T] s, and their holograms are expected to be afterwards.
+    """What the bodies, or the matter in motion, of `run` at `times` [T] s and their holograms are expected to be
+    afterwards.
 
     scan: of the run, and of later times where it has them: these judge the forecast, and are used for nothing else;
-    journal: keeps the fits. Errors: `InputError` for runs that are not of `track`, and for a scan without the run's
-    last time.
+    journal: keeps the fits to bodies. Errors: `InputError` for runs of neither, and for a scan without the run's last
+    time.
     """
-    bodies, times = tracked_bodies(run), np.asarray(times, dtype=np.float64)
+    times = np.asarray(times, dtype=np.float64)
     ahead = options.ahead(times)
     slack = SAME_TIME * float(np.median(np.diff(times)))
     within = (scan.exposures.time >= times[0] - slack) & (scan.exposures.time <= times[-1] + slack)
     known = scan[np.flatnonzero(within)]
     last = np.flatnonzero(np.abs(scan.exposures.time - times[-1]) <= slack)
     require(len(last) > 0, f"the scan must have frames of the run's last time, {times[-1]:.6g} s, but it has none.")
+    if isinstance(run.object, MovingGaussians):
+        moving = FlowHistory(run.object, _evened(run, known)[0], partial(_rendered, run))
+        way = options.flow or (None if options.decides else PATHS)
+        found, decision, kind = forecast_matter(
+            moving, ahead, way, options.half_sets, lambda stage, part: on_progress(stage, part, {})
+        )
+    else:
+        found, decision, kind = _of_bodies(run, known, times, ahead, options, seed, journal, on_progress)
+    exposures, backend = scan.exposures[last].repeated(ahead), found.object.backend
+    frames = render_object(found.object, exposures, run.oversample, backend)
+    predicted = Scan(frames, exposures, np.zeros(len(frames), dtype=bool), {"forecast": kind})
+    return Forecasted(found, predicted, _judged(found, run, scan, known, slack), decision)
+
+
+def _rendered(run: Reconstruction, matter: MovingGaussians, scan: Scan) -> torch.Tensor:
+    """The frames [V, H, W] of `matter` as `scan` takes them."""
+    return torch.from_numpy(render_object(matter, scan.exposures, run.oversample, matter.backend))
+
+
+def _of_bodies(
+    run: Reconstruction,
+    known: Scan,
+    times: np.ndarray,
+    ahead: np.ndarray,
+    options: ForecastOptions,
+    seed: int,
+    journal: Journal | None,
+    on_progress: FitProgress,
+) -> tuple[Forecast, Decision | None, str]:
+    """The forecast of bodies, what was decided, and the way in which they go on."""
+    tracked_bodies(run)
     history = _history(run, known, times, options, seed, Run(journal), on_progress)
     on_progress("forecast", 0.0, {})
     decision, way = None, options.way
@@ -176,11 +226,7 @@ def forecast(
         found = way.fit(history).ahead(ahead)
     if history.halves is None:
         found = replace(found, band=np.full_like(found.band, np.nan))
-    found = replace(found, rest=run.rest)
-    exposures = scan.exposures[last].repeated(ahead)
-    frames = render_object(found.bodies, exposures, run.oversample, bodies.backend)
-    predicted = Scan(frames, exposures, np.zeros(len(frames), dtype=bool), {"forecast": way.kind})
-    return Forecasted(found, predicted, _judged(found, run, scan, known, slack), decision)
+    return replace(found, rest=run.rest), decision, way.kind
 
 
 def _others(options: ForecastOptions, history: History, ahead: np.ndarray) -> tuple[list[Forecaster], str]:
@@ -220,16 +266,17 @@ def write_forecast(folder: RunFolder, run: Reconstruction, found: Forecasted) ->
     The run has begun with `config_of`. Returns the bodies as a reconstruction.
     """
     said = found.forecast
-    done = replace(run, object=said.bodies, method=ForecastOptions.kind, timing={}, verdict=None, total=None)
-    write_object(folder.object, said.bodies, folder.marks())
-    if said.rest is not None:
+    done = replace(run, object=said.object, method=ForecastOptions.kind, timing={}, verdict=None, total=None)
+    write_object(folder.object, said.object, folder.marks())
+    of_bodies = isinstance(said, Forecast)
+    if of_bodies and said.rest is not None:
         mesh = said.rest.elastic.membrane.mesh
         write_rest(folder, replace(mesh, vertices=said.bodies.unit_length * mesh.vertices))
-    told = {"steps": 0, "times_s": said.times.tolist(), "bodies": said.bodies.count}
+    told = {"steps": 0, "times_s": said.times.tolist(), **({"bodies": said.bodies.count} if of_bodies else {})}
     folder.write_summary(summary_of(done, None, found.predicted) | told)
     write_scan(folder.path / FRAMES, found.predicted)
     errors = ([f"{t:.15g}", k, f"{e:.4g}"] for t, band in zip(said.times, said.band) for k, e in enumerate(band))
-    write_rows(folder.path / TABLE, ["time_s", "body", "standard_error_m"], errors)
+    write_rows(folder.path / TABLE, ["time_s", "body" if of_bodies else "part", "standard_error_m"], errors)
     band = [None if np.isnan(one) else float(one) for one in said.usual_band()]
     write_json(
         folder.path / NUMBERS,
@@ -237,11 +284,12 @@ def write_forecast(folder: RunFolder, run: Reconstruction, found: Forecasted) ->
             "times_s": said.times.tolist(),
             "band_m": band,
             "held_out": found.judged,
-            "flow": said.told,
+            "flow": said.told if of_bodies else {},
             "decision": found.decision and found.decision.as_dict(),
         },
     )
-    write_tracks(folder, said.bodies, found.predicted)
+    if of_bodies:
+        write_tracks(folder, said.bodies, found.predicted)
     return done
 
 
@@ -275,14 +323,14 @@ def config_of(options: ForecastOptions, scan: Scan, run: dict[str, Any], seed: i
                 "kind": options.kind,
                 "of": run.get(RUN, ""),
                 "body": run["method"].get("body"),
-                "forecast": "auto" if options.decides else options.way.kind,
+                "forecast": "auto" if options.decides else options.flow or options.way.kind,
             },
             **to_table(options),
         },
         "seed": seed,
         "prior": run["prior"],
         "light": run.get("light", {}),
-        "matter": "levels",
+        "matter": run.get("matter", "levels"),
         "scan_hash": scan_hash(scan),
     }
 
@@ -327,10 +375,12 @@ def _evened(run: Reconstruction, known: Scan) -> tuple[Scan, Light | None]:
     return replace(train, frames=part.evened(torch.from_numpy(train.frames)).numpy()), part
 
 
-def _judged(found: Forecast, run: Reconstruction, scan: Scan, known: Scan, slack: float) -> list[dict[str, float]]:
+def _judged(
+    found: Forecast | FlowForecast, run: Reconstruction, scan: Scan, known: Scan, slack: float
+) -> list[dict[str, float]]:
     """Scores of the frames after the run's last time and within the forecast, a row a time; `_still`: of bodies that
     stay where they are at the last time."""
-    last, rows = float(found.bodies.basis.first), list[dict[str, float]]()
+    last, rows = float(found.object.basis.first), list[dict[str, float]]()
     data_range = intensity_range(known.frames)
     lit = light_of(scan, run.light, run.still)
     for time in scan.instants[(scan.instants > last + slack) & (scan.instants <= found.times[-1] + slack)]:
@@ -338,8 +388,8 @@ def _judged(found: Forecast, run: Reconstruction, scan: Scan, known: Scan, slack
         measured = scan[kept].frames
         factor = 1.0 if lit is None else lit.part(torch.from_numpy(kept)).factor().numpy().astype(np.float32)
         row = {"time_s": float(time)}
-        for ending, obj in (("", found.bodies.at(float(time))), ("_still", found.bodies.at(last))):
-            said = render_object(obj, scan.exposures[kept], run.oversample, found.bodies.backend) * factor
+        for ending, obj in (("", found.object.at(float(time))), ("_still", found.object.at(last))):
+            said = render_object(obj, scan.exposures[kept], run.oversample, found.object.backend) * factor
             mean = image_scores(said, measured, data_range).mean
             row |= {f"{name}{ending}": float(mean[name]) for name in ("ssim", "psnr", "l1")}
         rows.append(row)
