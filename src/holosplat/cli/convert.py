@@ -13,6 +13,7 @@ from tyro.conf import Positional, arg
 from ..baselines.retrieve import Retrieved
 from ..baselines.retrieve import retrieve as act
 from ..checks import InputError, require
+from ..frames import evenly
 from ..io.atomic import atomic_path
 from ..io.formats import HDF5_SUFFIXES, ScanFormat, loader_of, read_as, read_frames, read_volume_file
 from ..io.images import TiffLayout, write_tiff
@@ -24,6 +25,7 @@ from ..io.reading import Reading
 from ..matter import DeltaBeta, KnownRatio, MaterialPrior
 from ..methods.method import STAND_IN_RATIO, shows_no_refraction
 from ..optics import retrieve_thickness
+from ..preprocess import require_relative
 from ..ranges import Metres, Natural, Positive, Signed, checked_dataclass, flag
 from ..scan import Scan
 from ..workflows.preconditions import check_frames
@@ -118,7 +120,10 @@ def convert(
         reading.told.wall is None, "--wall is part of models and changes no frames; give it to reconstruct instead."
     )
     scan = read_as(source, reading, joined=False)
-    if loader_of(source).name == "r2-gaussian":
+    loader = loader_of(source)
+    if loader.opens is not None:  # which may hold counts
+        require_relative(np.asarray(scan.source[evenly(len(scan), 3)]))
+    if loader.name == "r2-gaussian":
         say(f"{source} has no phase: transmission exp(-p) in contact, where a density of 1 has beta "
              f"{scan.provenance['beta_of_density_1']}; reconstruct it with --delta-beta 1, and read beta")  # fmt: skip
     prior = matter.prior(scan.exposures.reference_energy)

@@ -11,6 +11,7 @@ import torch
 from ..frames import binned
 from ..optics.air import find_air
 from ..optics.noise import noise_levels
+from ..preprocess import RELATIVE
 from ..units import in_percent, two_digits
 
 LOOKED = 3
@@ -23,8 +24,6 @@ ABOVE = 2.0
 """Times the noise's power from which on frames show structure."""
 NOISELESS = 0.02
 """Noise, as a share of the contrast, below which frames count as free of noise, as in the verdict on a run."""
-RELATIVE = (0.2, 5.0)
-"""Levels of frames that were divided by their flat field."""
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,10 @@
 
 from .eigen_flats import EigenFlats, TotalVariationWeights, eigen_flats, significant
 from .pixels import PixelRepair, defective_pixels, fixed_pattern, relative_intensity, unlit
+from .relative import RELATIVE, require_relative
 
 __all__ = [
+    "RELATIVE",
     "EigenFlats",
     "PixelRepair",
     "TotalVariationWeights",
@@ -11,6 +13,7 @@ __all__ = [
     "eigen_flats",
     "fixed_pattern",
     "relative_intensity",
+    "require_relative",
     "significant",
     "unlit",
 ]
