@@ -11,7 +11,7 @@ from .neural_field import NeuralFields, NeuralFit
 from .onix import AlignedFit, Onix, PixelNerf
 from .per_view import PerView
 from .pinn import Pinn, PinnFit
-from .solve import Settled, settled, solve
+from .solve import Settled, require_possible, settled, solve
 from .surface_fit import Extraction, SurfaceFit, SurfaceOptions
 from .surfaces import Surfaces, refine_surfaces
 from .uncertain import Determined, Uncertain
@@ -73,6 +73,7 @@ __all__ = [
     "finished",
     "gaussian_fit",
     "refine_surfaces",
+    "require_possible",
     "settled",
     "solve",
 ]
