@@ -37,6 +37,18 @@ def test_help_loads_nothing_heavy(arguments):
     assert f"holosplat {' '.join(arguments)}".strip() in said
 
 
+def test_the_first_line_comes_before_what_takes_seconds_to_load(tmp_path):
+    """Nothing is loaded where arguments are refused."""
+    (tmp_path / "torch.py").write_text("raise SystemExit('loaded')\n")
+    told = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    for options, code, said in ((["--out", "run"], 1, "loading libraries …\nloaded\n"), ([], 2, "--out")):
+        command = [sys.executable, "-m", "holosplat", "reconstruct", str(tmp_path), *options]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, env=told, cwd=tmp_path)
+        assert done.returncode == code
+        assert said in done.stderr
+        assert "loaded" in done.stderr or code == 2
+
+
 def test_nothing_is_searched_for_garbage_in_the_end():
     """Functions that are registered first are called last."""
     code = "import atexit, gc, sys\natexit.register(lambda: print(gc.get_freeze_count()))\n"

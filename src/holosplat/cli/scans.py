@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ..checks import as_written, require
 from ..io.atomic import read_json, require_writable
@@ -14,14 +15,13 @@ from ..io.reading import Part, Reading, at_time
 from ..methods.continued import Continued
 from ..methods.presets import method_of
 from ..methods.solve import Settled
-from ..report.compare import Side, side_of
-from ..report.run import report_run
 from ..scan import Scan
 from ..series.collect import collect
 from ..series.folder import SeriesFolder
 from ..series.plan import prior_of
 from ..tables import from_table
-from ..workflows.evaluate import TIMES, evaluate, render, require_overlap, require_same_field, write_times
+from ..volume import Volume
+from ..workflows.evaluate import TIMES, Evaluation, evaluate, render, require_overlap, require_same_field, write_times
 from ..workflows.preconditions import require_one_time
 from ..workflows.provenance import scan_hash
 from ..workflows.reconstruct import load_reconstruction
@@ -30,6 +30,13 @@ from ..workflows.rehearsal import rehearse
 from ..workflows.run_folder import RunFolder, claimed
 from .progress import ProgressBar
 from .sentence import put, say, tell_result
+
+if TYPE_CHECKING:
+    from ..report.compare import Side
+
+
+TRUTH = "truth"
+"""The file of source.json by which a run was evaluated, for pages that are written again."""
 
 
 def scan_for(folder: RunFolder, scan: Path | None, reading: Reading) -> Scan:
@@ -69,6 +76,16 @@ def runs_of(path: Path) -> list[tuple[float, RunFolder]]:
         return []
     each = [(window.number, moment) for window in plan.windows() for moment in window.own]
     return [(moment.time, RunFolder(series.run(task, moment.number))) for task, moment in each]
+
+
+def report_run(
+    folder: RunFolder, result: Reconstruction, shown: Scan, found: Evaluation, truth: Volume | None, remark: str = ""
+) -> Path:
+    """Write the report of a run, which takes seconds, and first load what draws it."""
+    say("report …")
+    from ..report.run import report_run as write
+
+    return write(folder, result, shown, found, truth, remark)
 
 
 def report_of_middle(folder: RunFolder, result: Reconstruction, measured: Scan) -> Path:
@@ -121,6 +138,12 @@ def predict(run: Path, scan: Path, out: Path, split: str, reading: Reading) -> N
     say(f"wrote {out}: {len(frames)} predicted frames")
 
 
+def _known_truth(folder: RunFolder, result: Reconstruction) -> Volume | None:
+    """The truth that the run was evaluated by, if it is there."""
+    told = read_json(folder.source).get(TRUTH) if folder.source.is_file() else None
+    return read_volume_file(Path(told), result.delta_told) if isinstance(told, str) and Path(told).is_file() else None
+
+
 def judge(run: Path, scan: Path | None, truth: Path | None, as_json: bool, reading: Reading) -> None:
     """Print the scores of a run, by a truth, too, and renew its report by that."""
     folder = RunFolder(run)
@@ -141,11 +164,15 @@ def judge(run: Path, scan: Path | None, truth: Path | None, as_json: bool, readi
         say("this is not the scan that was reconstructed, its frames may have been fitted; report unchanged")
     elif true_volume is not None or not folder.report.exists():
         with claimed(folder):
+            if truth is not None and folder.source.is_file():
+                folder.write_source(read_json(folder.source) | {TRUTH: str(truth.resolve())})
             say(f"report: {report_run(folder, result, measured, evaluation, true_volume)}")
 
 
 def side_of_run(path: Path) -> Side:
     """A run with its scores, as far as its scan is still there."""
+    from ..report.compare import side_of
+
     folder, scan = RunFolder(path), None
     folder.require_run()
     told = read_json(folder.source).get("scan") if folder.source.is_file() else None
@@ -180,6 +207,7 @@ def _rehearse(folder: RunFolder, times: int, bins: int | None, reading: Reading)
         with ProgressBar() as bar:
             how = {"times": times, "bins": bins, "seed": seed, "folder": folder, "on_progress": bar.show}
             found = rehearse(result, measured, prior, method, **how)
-        page = report_run(folder, result, measured, evaluate(result, measured, None), None)
+        truth = _known_truth(folder, result)
+        page = report_run(folder, result, measured, evaluate(result, measured, truth), truth)
     put(found.lines())
     say(f"report: {page}")

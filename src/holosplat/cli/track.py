@@ -28,7 +28,6 @@ from ..motion.track import TrackOptions
 from ..optics.background import LightOptions
 from ..planning.acts import of_motion, of_surfaces, of_track
 from ..ranges import Metres, Seed, Share, Weight, checked_dataclass
-from ..report.run import report_run
 from ..representations import MovingSurfaces
 from ..scan import Scan
 from ..tables import with_entries
@@ -46,7 +45,7 @@ from .light import LightFlags
 from .options import PriorOptions
 from .places import Output
 from .progress import ProgressBar
-from .scans import report_of_middle, run_and_scan
+from .scans import report_of_middle, report_run, run_and_scan
 from .sentence import interruptible, put, say, tell_frames, tell_result
 
 
