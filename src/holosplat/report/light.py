@@ -22,9 +22,9 @@ from .style import (
     SIGNED_MAP,
     WIDTH,
     PanelGrid,
+    around_zero,
     colour_bar,
     decimal_scale,
-    from_dark,
     grey_limits,
     image_panel,
     largest,
@@ -65,7 +65,7 @@ def phase_figure(
     chosen = evenly(len(measured), most)
     phase, limits = phase[chosen], grey_limits(phase[chosen], (0.02, 99.98))
     factor = np.ones_like(phase) if light is None else light[chosen]
-    third = (phase, from_dark(PHASE_MAP, limits), limits, "Phase", "phase (rad)")
+    third = (phase, *around_zero(PHASE_MAP, limits), "Phase", "phase (rad)")
     return _beside(measured[chosen], factor, third, [labels[int(n)] for n in chosen], pixel_sizes[chosen].tolist())
 
 

@@ -36,7 +36,7 @@ from ..workflows.run_folder import RunFolder
 from ..workflows.track import read_errors
 from .content import GuessShown, HeldOutViews, LitViews, Moving, ProjectedMaps, ReportContent, view_labels
 from .page import write_report
-from .style import ENDS, data_uri, new_figure, styled
+from .style import DELTA_MAP, ENDS, around_zero, data_uri, new_figure, styled
 from .surface import ForecastShown
 from .view3d.view import SLICE_BYTES, VOLUME_BYTES, View3D, part_of, raster_of, volume_part
 
@@ -179,8 +179,8 @@ def _scan_of(folder: RunFolder) -> str:
 def _title(config: Mapping[str, Any], reconstruction: Reconstruction) -> str:
     found = reconstruction.object
     matter, name = found.matter, NAMES.get(found.kind, f"Reconstruction as {found.described}")
-    count = "δ and β free" if not matter.occupancies else f"{COUNTED.get(len(matter), len(matter))} material"
-    count += "s" if len(matter.others) else ""
+    told = max(len(matter), 1 + len(config["prior"].get("others", ())))  # a volume has one channel for all that is told
+    count = "δ and β free" if not matter.occupancies else f"{COUNTED.get(told, told)} material{'s' * (told > 1)}"
     if not reconstruction.delta_told:
         return f"{name}, of absorption alone"
     said = {"known": ", known", "ratio": " of known δ/β", "free": ", found" if matter.occupancies else ""}
@@ -321,7 +321,7 @@ def still_picture(phase: np.ndarray, sign: float = 1.0) -> str:
     rows, columns = phase.shape
     figure = new_figure(2.4, 2.4 * rows / columns, layout="none")
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    low, high = phase_ends(phase, sign)
-    axes.imshow(sign * phase, cmap="magma", vmin=sign * low, vmax=sign * high)
+    colours, (low, high) = around_zero(DELTA_MAP, (min(ends := phase_ends(phase, sign)), max(ends)))
+    axes.imshow(phase, cmap=colours, vmin=low, vmax=high)
     axes.axis("off")
     return data_uri(figure, "png")
