@@ -101,6 +101,12 @@ def plain(value: float, digits: int = 3) -> str:
     return np.format_float_positional(rounded + 0.0, trim="-")
 
 
+def number_of(count: int, noun: str) -> str:
+    """A number of things: 1 body, 2 bodies."""
+    several = f"{noun[:-1]}ies" if noun.endswith("y") else f"{noun}s"
+    return f"{count} {noun if count == 1 else several}"
+
+
 def two_digits(value: float) -> str:
     """`value` to two digits, or to a whole number from a hundred on; never with an exponent."""
     return plain(value, 2)

@@ -126,7 +126,7 @@ def test_gaps_and_noise_and_counts_are_seen(tmp_path):
     kept = scan[np.r_[0:8, 12:20]]
     write_scan(tmp_path / "gap.nxs", kept)
     found = rows(tmp_path / "gap.nxs")
-    assert found["steps"] == ["9°, 1 gaps: 63° to 108°"]
+    assert found["steps"] == ["9°, 1 gap: 63° to 108°"]
     noise = float(found["noise"][0].split(" %")[0])
     assert noise == pytest.approx(100 / np.sqrt(200), rel=0.4)
     counts = tmp_path / "counts.npz"

@@ -28,6 +28,7 @@ from ..optics import retrieve_thickness
 from ..preprocess import require_relative
 from ..ranges import Metres, Natural, Positive, Signed, checked_dataclass, flag
 from ..scan import Scan
+from ..units import number_of
 from ..workflows.preconditions import check_frames
 from ..workflows.run_illumination import FixedPatternOptions, flatfield_corrected
 from .light import LightFlags
@@ -147,7 +148,7 @@ def convert(
         if writing.truth:
             said["truth"] = read_volume_file(writing.truth)
         write_r2_gaussian(out, scan, *_retrieved(scan, prior), replace(R2Options(), **said))
-    say(f"wrote {out}: {to}, {len(scan)} frames of {scan.views.shape[0]} × {scan.views.shape[1]} pixels, "
+    say(f"wrote {out}: {to}, {number_of(len(scan), 'frame')} of {scan.views.shape[0]} × {scan.views.shape[1]} pixels, "
          f"{int(scan.is_test.sum())} of them held out")  # fmt: skip
 
 
@@ -234,7 +235,7 @@ def retrieve(
     print(f"phase from {low:.4g} to {high + 0.0:.4g} rad (quantiles 1e-4 and 1 - 1e-4); light {words}")
     if not measured.exposures.distance.any():
         say("the frames are in contact: they show absorption, and the phase is what δ/β makes of it")
-    say(f"wrote {out}: {what}, {len(measured)} frames")
+    say(f"wrote {out}: {what}, {number_of(len(measured), 'frame')}")
 
 
 def _preview(path: Path, measured: Scan, found: Retrieved) -> None:

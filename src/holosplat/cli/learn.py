@@ -10,6 +10,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from ..ranges import Jobs, Seed, Within
 from ..training.options import Ranges, TrainOptions
+from ..units import number_of
 from .places import Kept, Output
 from .progress import ProgressBar
 from .sentence import interruptible, tell
@@ -55,10 +56,10 @@ def dataset(
             export(wanted, layout, lambda part, layout=layout: bar.show(f"{layout} files", part, {}))
             for layout in layouts
         ]
-    print(f"wrote {made} files of scenes; {out / 'datasheet.md'} says what they are")
+    print(f"wrote {number_of(made, 'file')} of scenes; {out / 'datasheet.md'} says what they are")
     for each in done:
         left_out = f"; left out, for their views have no common axis: {len(each.left_out)}" if each.left_out else ""
-        print(f"wrote {each.count} scene{'s' * (each.count > 1)} into {each.folder}{left_out}")
+        print(f"wrote {number_of(each.count, 'scene')} into {each.folder}{left_out}")
 
 
 def _needs(drawn: Ranges, scenes: int, jobs: int) -> Needs:

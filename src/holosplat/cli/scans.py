@@ -20,6 +20,7 @@ from ..series.collect import collect
 from ..series.folder import SeriesFolder
 from ..series.plan import prior_of
 from ..tables import from_table
+from ..units import number_of
 from ..volume import Volume
 from ..workflows.evaluate import TIMES, Evaluation, evaluate, render, require_overlap, require_same_field, write_times
 from ..workflows.preconditions import require_one_time
@@ -135,7 +136,7 @@ def predict(run: Path, scan: Path, out: Path, split: str, reading: Reading) -> N
     require(len(chosen) > 0, f"{scan} has no {split} frames to render; choose another --split.")
     frames = render(result, chosen.exposures)
     write_scan(out, Scan(frames, chosen.exposures, chosen.is_test, {"rendered_from": run.name}))
-    say(f"wrote {out}: {len(frames)} predicted frames")
+    say(f"wrote {out}: {number_of(len(frames), 'predicted frame')}")
 
 
 def _known_truth(folder: RunFolder, result: Reconstruction) -> Volume | None:

@@ -31,6 +31,7 @@ from ..ranges import Metres, Seed, Share, Weight, checked_dataclass
 from ..representations import MovingSurfaces
 from ..scan import Scan
 from ..tables import with_entries
+from ..units import number_of
 from ..workflows.evaluate import TIMES, Evaluation, score_object, write_times
 from ..workflows.evaluate import evaluate as score
 from ..workflows.forecast import read_forecast
@@ -283,7 +284,7 @@ def surface(
     write_bodies(out, bodies, [constants] * len(bodies), said)
     for of, scores in ((name, before), ("surfaces", after)):
         print(f"{of}:", *scores.lines(), sep="\n  ")
-    say(f"wrote {out}: {len(bodies)} bodies of {len(found.faces)} triangles, {seconds:.1f} s")
+    say(f"wrote {out}: {number_of(len(bodies), 'body')} of {len(found.faces)} triangles, {seconds:.1f} s")
 
 
 def write_bodies(

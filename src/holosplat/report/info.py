@@ -11,7 +11,7 @@ from ..io.facts import Facts, facts_of_matter, no_kind
 from ..io.formats import loader_of
 from ..io.reading import Reading
 from ..memory import uncollected
-from ..units import beam_named, in_percent
+from ..units import beam_named, in_percent, number_of
 from ..workflows.choice import Choice
 from ..workflows.run_folder import SERIES, RunFolder
 
@@ -95,7 +95,7 @@ def facts_of_series(path: Path) -> Facts:
         done = [row for _, row in sorted(rows.items()) if row["status"] == "done"]
         judged = [(row["number"], bool(row["good"]), str(row["words"])) for row in done if row["good"] is not None]
     chosen, count = begun_motion(path), sum(times for _, times in scans)
-    said = {"what": f"a series of {count} times", "made from": ", ".join(scan for scan, _ in scans)}
+    said = {"what": f"a series of {number_of(count, 'time')}", "made from": ", ".join(scan for scan, _ in scans)}
     said |= {"state": f"{len(done)} of {count} times are done"}
     said |= {"verdict": "; ".join(line.strip().rstrip(".") for line in said_of_times(judged, count))} if judged else {}
     said |= {"chosen": chosen.line} if chosen else {}

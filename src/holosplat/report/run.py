@@ -25,7 +25,7 @@ from ..projectors.voxels import voxel_line_integrals
 from ..representations import MovingSurfaces, Stored
 from ..scan import Scan
 from ..tables import to_table
-from ..units import beam_named, span, wavenumber
+from ..units import beam_named, number_of, span, wavenumber
 from ..volume import Volume
 from ..workflows.evaluate import TIMES, Evaluation, lines_of_times, of_absorption, render
 from ..workflows.forecast import NUMBERS, flow_in_words, read_band
@@ -197,7 +197,7 @@ def _summary(reconstruction: Reconstruction, scan: Scan, moving: Moving | None) 
     if moving is not None:
         state += f" Volumes, slices and projections are those at {1e6 * _middle(moving):.4g} µs."
     return (
-        f"{len(scan.train())} training and {len(scan.test())} held-out frames of {h} × {w} pixels of "
+        f"{len(scan.train())} training and {number_of(len(scan.test()), 'held-out frame')} of {h} × {w} pixels of "
         f"{span(1e6 * views.pixel_sizes)} µm, {beam_named(exposures.energy_kev)[1]}, {distance}; "
         f"{reconstruction.object.described}.{state}"
     )
