@@ -11,7 +11,6 @@ import torch
 from ..frames import binned
 from ..optics.air import find_air
 from ..optics.noise import noise_levels
-from ..preprocess import RELATIVE
 from ..units import in_percent, two_digits
 
 LOOKED = 3
@@ -61,11 +60,6 @@ class Look:
     def is_light(self) -> bool:
         """Whether the values can be intensities, which are above 0 but for noise."""
         return self.level > 0 and self.least > -self.level
-
-    @property
-    def is_relative(self) -> bool:
-        """Whether frames seem to have been divided by a flat field, by their level."""
-        return RELATIVE[0] < self.level < RELATIVE[1]
 
     def rows(self) -> dict[str, str]:
         """The same in words, by name."""

@@ -31,6 +31,7 @@ from ..methods.gaussians import Gaussians
 from ..methods.window import windows_of
 from ..optics.noise import NoiseModel, noise_levels, noise_share
 from ..optics.sampling import fringes, on_larger_pixels
+from ..preprocess import fault_of
 from ..scan import Exposures, Scan
 from ..units import beam_named, number_of, span
 from .acts import of_each_time
@@ -74,7 +75,6 @@ class ScanFacts:
 def facts_of_scan(loader: Loader, path: Path, reading: Reading) -> ScanFacts:
     """Describe the scan at `path`. Errors: `InputError` for faults that stop its reading and that no option mends."""
     stand_ins, unsaid = dict[str, Any](), dict[str, str]()
-    reading.told.vouch(path)
     while True:
         try:
             given = stand_ins | reading.told.given(loader.takes)
@@ -138,10 +138,8 @@ def _facts(path: Path, reading: Reading, loader: Loader, opened: Opened, unsaid:
             f"{path} must hold intensities, which are above 0, but its level is {look.level:.4g}; of the slices of a "
             "volume, `holosplat simulate` makes frames (--voxel-size)."
         )
-    elif not look.is_relative:
-        missing.append(
-            f"{path} holds counts (level {look.level:.4g}) that nothing divides; divide them by --flats and --darks."
-        )
+    elif fault := fault_of(look.level):
+        missing.append(f"{path}: {fault}")
     words = ["holosplat reconstruct", shlex.quote(str(path)), *_options(reading)]
     words += [f"--{OPTIONS.get(name, name)} …" for name in unsaid]
     more = " ".join([*words, *["--motion each"] * scan.is_series, "--out run"])

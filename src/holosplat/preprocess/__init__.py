@@ -2,15 +2,15 @@
 
 from .eigen_flats import EigenFlats, TotalVariationWeights, eigen_flats, significant
 from .pixels import PixelRepair, defective_pixels, fixed_pattern, relative_intensity, unlit
-from .relative import RELATIVE, require_relative
+from .relative import fault_of, require_relative
 
 __all__ = [
-    "RELATIVE",
     "EigenFlats",
     "PixelRepair",
     "TotalVariationWeights",
     "defective_pixels",
     "eigen_flats",
+    "fault_of",
     "fixed_pattern",
     "relative_intensity",
     "require_relative",

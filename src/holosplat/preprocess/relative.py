@@ -12,14 +12,21 @@ MOST_NEGATIVE = 0.25
 """Share of the pixels that may be below zero: noise makes half of those so that an absorber darkens wholly."""
 
 
+def fault_of(level: float) -> str:
+    """Why frames of this `level` are not relative to the flat field; empty where they may be."""
+    if RELATIVE[0] < level < RELATIVE[1]:
+        return ""
+    remedy = "divide counts by their flats, with --flats and --darks or image_key 1 and 2 in the file"
+    if level < 1:
+        remedy = "take flats of the same exposure, and none for frames that were divided before"
+    wanted = "frames must be relative to the flat field (about 1 beside the sample)"
+    return f"{wanted}, but their level is {level:.4g}; {remedy}."
+
+
 def require_relative(frames: np.ndarray) -> None:
     """`InputError` for frames [N, H, W] that are not relative to the flat field, by their median, or no intensities."""
-    level = float(np.median(frames))
-    require(
-        RELATIVE[0] < level < RELATIVE[1],
-        f"frames must be relative to the flat field (about 1 beside the sample), but their median is {level:.4g}; "
-        "divide counts by their flats, with --flats and --darks or image_key 1 and 2 in the file.",
-    )
+    fault = fault_of(float(np.median(frames)))
+    require(not fault, fault)
     negative = float((frames < 0).mean())
     require(
         negative <= MOST_NEGATIVE,

@@ -48,6 +48,7 @@ def info(path: str | Path, reading: Reading = Reading(), picture: Path | None = 
     if picture is not None:
         require(picture.suffix.lower() == ".png", f"--picture must be a .png file, but it is {picture}; name another.")
         require_writable(picture)
+    reading.told.vouch(path)
     found = None
     try:
         if (path / SERIES).is_file():

@@ -13,6 +13,7 @@ from ..frames import evenly
 from ..optics.sampling import fringes
 from ..planning.look import Spectrum
 from ..planning.scan_facts import OPTICS, ScanFacts
+from ..preprocess import fault_of
 from .content import LitViews, pixel_of
 from .style import (
     FAINT,
@@ -122,7 +123,7 @@ def look_figure(found: ScanFacts) -> Figure:
             scale_bar(axes, w * pixel)
         letter(axes, k, f"Frame {found.numbers[n]}")
     if drawn is not None:
-        name = "Relative intensity" if look.is_relative else "Counts"
+        name = "Counts" if fault_of(look.level) else "Relative intensity"
         colour_bar(figure, drawn, figure.add_subplot(grid[0, len(shown)]), name, "both")
     axes = figure.add_subplot(grid[0, len(shown) + 1])
     _spectrum(axes, look.spectrum, found, pixel)
