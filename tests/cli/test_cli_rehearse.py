@@ -57,6 +57,17 @@ def test_intervals_are_printed_and_kept(run, monkeypatch):
     assert trusted[table["word"]] in compared
 
 
+def test_a_volume_that_was_told_levels_once_is_rehearsed(run, tmp_path, monkeypatch):
+    """As older versions let it be."""
+    monkeypatch.setattr(certainty, "MISTAKES", {})
+    mine = tmp_path / "run"
+    few = ("--method", "volume", "--set", "volume.iterations=4", "--set", "iterations=2", "--material", "water")
+    worked(holosplat("reconstruct", run.parent / "scan.nxs", *few, "--out", mine))
+    summary = read_json(mine / "summary.json")
+    write_json(mine / "summary.json", summary | {"decided": summary["decided"] | {"matter": "levels"}})
+    worked(holosplat("rehearse", mine, "--times", 2))
+
+
 def test_a_page_keeps_the_truth_by_which_the_run_was_evaluated(run, tmp_path, monkeypatch):
     monkeypatch.setattr(certainty, "MISTAKES", {})
     mine, page = tmp_path / "run", tmp_path / "run/report.html"

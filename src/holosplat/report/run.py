@@ -84,7 +84,8 @@ def report_run(
     material = found.matter.single and reconstruction.choice.matter == "levels"  # else a unit of δ
     train = scan.train()
     absorbs = not scan.exposures.distance.any()  # then δ, where it is told, is β times a ratio that no frame shows
-    if absorbs or not reconstruction.delta_told:
+    delta_told = reconstruction.delta_told and not absorbs
+    if not delta_told:
         volume = of_absorption(volume)
         truth = None if truth is None else of_absorption(truth)
     if absorbs and reconstruction.delta_told:
@@ -112,7 +113,7 @@ def report_run(
         seen=views_seeing(train.exposures, grid) == len(train),
         material_delta=(found.matter.beta if absorbs else found.matter.delta) if material else None,
         explained=reconstruction.verdict,
-        delta_told=reconstruction.delta_told and not absorbs,
+        delta_told=delta_told,
         total=reconstruction.total,
         rehearsal=read_rehearsal(folder),
         geometry=reconstruction.geometry,
@@ -121,7 +122,7 @@ def report_run(
         guess=_guess(folder, reconstruction),
         forecast=_forecast(folder),
         decisions=(*([chosen] if chosen else ()), *reconstruction.choice.decisions),
-        view=view_of(turned, volume, truth, scan, reconstruction.delta_told),
+        view=view_of(turned, volume, truth, scan, delta_told),
         history=folder.history(),
         seconds=sum(reconstruction.timing.values()),
         timing={stage: f"{seconds:.1f} s" for stage, seconds in reconstruction.timing.items()},
@@ -281,7 +282,7 @@ def view_of(obj: Stored, volume: Volume, truth: Volume | None, scan: Scan, delta
     exposures = scan.exposures[np.array([0])]
     _, _, pixel = raster_of(*exposures.views.shape, exposures.views.pitch)
     times = np.unique(scan.exposures.time) if isinstance(obj, MovingSurfaces) else None
-    shift = first_phase(obj, scan) * (1.0 if delta_told else 2.0)  # without δ, which is β then: the absorption 2k∫β
+    shift = first_phase(obj, scan, delta_told)
     sign = obj.matter.channels[0].sign
     shown = {"reconstruction": volume} | ({} if truth is None else {"truth": truth})
     parts = {"reconstruction": part_of(obj, volume, pixel, times)}
@@ -301,12 +302,12 @@ def view_of(obj: Stored, volume: Volume, truth: Volume | None, scan: Scan, delta
     )
 
 
-def first_phase(obj: Stored, scan: Scan) -> np.ndarray:
-    """k∫δ [H, W] [rad] in the first view."""
+def first_phase(obj: Stored, scan: Scan, delta_told: bool) -> np.ndarray:
+    """k∫δ [H, W] [rad] in the first view; where δ is not known the absorption 2k∫β."""
     exposures = scan.exposures[np.array([0])]
     with torch.no_grad():
-        _, delta = obj.project(exposures.views)
-    return float(wavenumber(exposures.energy_kev)[0]) * delta[0].numpy()
+        beta, delta = obj.project(exposures.views)
+    return float(wavenumber(exposures.energy_kev)[0]) * (delta if delta_told else 2 * beta)[0].numpy()
 
 
 def phase_ends(phase: np.ndarray, sign: float = 1.0) -> tuple[float, float]:
