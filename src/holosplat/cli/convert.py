@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
-import torch
 from tyro.conf import Positional, arg
 
-from ..baselines.retrieve import Retrieved
-from ..baselines.retrieve import retrieve as act
 from ..checks import InputError, require
 from ..frames import evenly
 from ..io.atomic import atomic_path
@@ -23,19 +20,17 @@ from ..io.phase_maps import PhaseMaps, is_file, write_phase_maps
 from ..io.r2_gaussian import R2Options, write_r2_gaussian
 from ..io.reading import Reading
 from ..matter import DeltaBeta, KnownRatio, MaterialPrior
-from ..methods.method import STAND_IN_RATIO, shows_no_refraction
-from ..optics import retrieve_thickness
-from ..preprocess import require_relative
 from ..ranges import Metres, Natural, Positive, Signed, checked_dataclass, flag
 from ..scan import Scan
 from ..units import number_of
-from ..workflows.preconditions import check_frames
-from ..workflows.run_illumination import FixedPatternOptions, flatfield_corrected
 from .light import LightFlags
 from .options import OneMaterial, PriorOptions
 from .places import Output
 from .progress import ProgressBar
 from .sentence import say
+
+if TYPE_CHECKING:
+    from ..baselines.retrieve import Retrieved
 
 
 @checked_dataclass
@@ -66,6 +61,9 @@ class EveningOptions:
 
     def applied(self, scan: Scan, prior: MaterialPrior) -> Scan:
         """The scan without such light."""
+        from ..methods.method import STAND_IN_RATIO, shows_no_refraction
+        from ..workflows.run_illumination import FixedPatternOptions, flatfield_corrected
+
         require(self.still_light is not None or self.inside is None, "--inside needs --still-light.")
         if self.still_light is None:
             return scan
@@ -123,6 +121,8 @@ def convert(
     scan = read_as(source, reading, joined=False)
     loader = loader_of(source)
     if loader.opens is not None:  # which may hold counts
+        from ..preprocess import require_relative
+
         require_relative(np.asarray(scan.source[evenly(len(scan), 3)]))
     if loader.name == "r2-gaussian":
         say(f"{source} has no phase: transmission exp(-p) in contact, where a density of 1 has beta "
@@ -155,6 +155,10 @@ def convert(
 def _retrieved(scan: Scan, prior: MaterialPrior) -> tuple[np.ndarray, float]:
     """Thickness [N, H, W] [m] of a material, by Paganin (2002), and its δ; of δ/β alone such that the greatest
     thickness is half the field's longer side."""
+    import torch
+
+    from ..optics import retrieve_thickness
+
     exposures, views = scan.exposures.optical, scan.views
     delta, beta = (1.0, 1.0 / prior.ratio) if isinstance(prior, KnownRatio) else prior.materials[0]
     refraction = exposures.refraction(delta, beta)
@@ -213,6 +217,9 @@ def retrieve(
         out: HDF5 file to write (.h5), or folder to make: a TIFF stack a map, maps.json and a preview.
         method: Tikhonov through the full wave optics is the most reliable; docs/phase_retrieval.md compares them.
     """
+    from ..baselines.retrieve import retrieve as act
+    from ..workflows.preconditions import check_frames
+
     measured = read_frames(scan, reading).in_memory()
     check_frames(measured)
     material, level = matter.at(measured.exposures.reference_energy)

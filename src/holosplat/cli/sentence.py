@@ -31,6 +31,16 @@ def say(text: str) -> None:
     print(text, file=sys.stderr)
 
 
+def say_that_libraries_load() -> None:
+    """Say it where that takes seconds, and once."""
+    if "torch" not in sys.modules and not _loading:
+        _loading.append(True)
+        say("loading libraries …")
+
+
+_loading = list[bool]()
+
+
 @contextmanager
 def interruptible(sentence: Callable[[], str]) -> Iterator[None]:
     """In the block, Ctrl-C says a `sentence`, and ends with `INTERRUPTED`."""
