@@ -167,6 +167,8 @@ def reconstruct(
             result = fit(measured, prior, method, seed, folder=folder, resume=resume, **ways, **told)
         report = scored(folder, result, measured, scan, reading)
     tell_found(folder, result, report)
+    if reading.part.time_frame == "still" and result.verdict is not None and not result.verdict.good:
+        say("all times were taken for one object that stands still; if it moves, name another --motion, such as each")
     _end(result, out, strict)
 
 

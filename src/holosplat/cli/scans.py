@@ -125,7 +125,9 @@ def tell_found(folder: RunFolder, result: Reconstruction, report: Path) -> None:
     tell_result(folder, result, report)
     if result.total:
         print(result.total.words)
-    say(f"not rehearsed: for intervals of these numbers, and a verdict beside them: holosplat rehearse {folder.path}")
+    if not instants_of(folder):
+        act = f"holosplat rehearse {folder.path}"
+        say(f"not rehearsed: for intervals of these numbers, and a verdict beside them: {act}")
 
 
 def predict(run: Path, scan: Path, out: Path, split: str, reading: Reading) -> None:
@@ -148,11 +150,17 @@ def _known_truth(folder: RunFolder, result: Reconstruction) -> Volume | None:
 def judge(run: Path, scan: Path | None, truth: Path | None, as_json: bool, reading: Reading) -> None:
     """Print the scores of a run, by a truth, too, and renew its report by that."""
     folder = RunFolder(run)
+    predicted = scan is None and folder.path.resolve() in folder.source_scan().resolve().parents
+    require(
+        not predicted or truth is not None,
+        f"{run} is a forecast of times without frames, so that only its own predictions could score it; name frames by "
+        "--scan, or a --truth.",
+    )
     result, measured = run_and_scan(folder, scan, reading)
     true_volume = read_volume_file(truth, result.delta_told) if truth else None
     if truth is not None and true_volume is not None:
         require_same_field(true_volume.grid, measured.views, truth)
-    evaluation = evaluate(result, measured, true_volume)
+    evaluation = evaluate(result, None if predicted else measured, true_volume)
     if truth is not None and evaluation.volume is not None:
         require_overlap(evaluation.volume, truth)
     if as_json:
@@ -197,6 +205,8 @@ def rehearse_each(run: Path, times: int, bins: int | None, reading: Reading) -> 
 
 
 def _rehearse(folder: RunFolder, times: int, bins: int | None, reading: Reading) -> None:
+    several = f"rehearse takes a run of matter at one time, but {folder.path} is of several; name a run of one time."
+    require(not instants_of(folder), several)
     result, measured = run_and_scan(folder, None, reading)
     config = folder.read_config()
     with as_written(folder.config, "what reconstruct wrote"):

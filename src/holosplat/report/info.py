@@ -128,7 +128,7 @@ def _of_run(folder: RunFolder) -> Facts:
             f"holosplat export {folder.path} --volume v.h5",
         ]
         commands += [f"holosplat view {folder.path}"]
-        if "verdict" in summary and "rehearsal" not in summary:
+        if "verdict" in summary and "rehearsal" not in summary and "times_s" not in summary:
             commands += [f"holosplat rehearse {folder.path}"]
     missing = [] if source else [f"{folder.path} does not say which scan it is of; name it with --scan."]
     return Facts(rows, tuple(missing), tuple(commands))
@@ -151,6 +151,7 @@ def _result(summary: dict) -> dict[str, str]:
     shares = ", ".join(f"{name} {in_percent(float(share))}" for name, share in judged.items())
     rows |= {"scores": f"matter that training frames leave unexplained: {shares}"} if shares else {}
     rows |= {"total": total["words"]} if "words" in total else {}
-    stages = ", ".join(f"{name} {value:.3g} s" for name, value in seconds.items())
-    rows["time"] = f"{sum(seconds.values()):.3g} s ({stages}) on {summary.get('device', 'an unknown device')}"
+    if seconds:
+        stages = ", ".join(f"{name} {value:.3g} s" for name, value in seconds.items())
+        rows["time"] = f"{sum(seconds.values()):.3g} s ({stages}) on {summary.get('device', 'an unknown device')}"
     return rows

@@ -59,10 +59,11 @@ def headline(content: ReportContent) -> Headline:
     text, details = text.rstrip("."), tuple(filter(None, (rest[:1].upper() + rest[1:],)))
     if content.rehearsal is not None and found is content.explained:
         return _rehearsed(content.rehearsal, (words, scores), content.scan)
+    unrehearsed = (NOT_REHEARSED,) * content.at_rest
     if found.good:
-        return Headline(text, True, (*details, scores, NOT_REHEARSED))
+        return Headline(text, True, (*details, scores, *unrehearsed))
     text = f"Do not trust this volume: {text[0].lower()}{text[1:]}"
-    reasons = (*(in_print(reason) for reason in found.reasons), NOT_REHEARSED)
+    reasons = (*(in_print(reason) for reason in found.reasons), *unrehearsed)
     return Headline(text, False, (*details, *reasons, scores), next_step(found.cause, content.scan))
 
 

@@ -30,7 +30,7 @@ from ..volume import Volume
 from ..workflows.evaluate import TIMES, Evaluation, lines_of_times, of_absorption, render
 from ..workflows.forecast import NUMBERS, flow_in_words, read_band
 from ..workflows.motion_choice import begun_motion
-from ..workflows.reconstruct import Reconstruction
+from ..workflows.reconstruction import Reconstruction, instants_of
 from ..workflows.rehearsal import read_rehearsal
 from ..workflows.run_folder import RunFolder
 from ..workflows.track import read_errors
@@ -116,6 +116,7 @@ def report_run(
         delta_told=delta_told,
         total=reconstruction.total,
         rehearsal=read_rehearsal(folder),
+        at_rest=not instants_of(folder),
         geometry=reconstruction.geometry,
         lit=_lit(reconstruction, scan, evaluation),
         moving=moving,
