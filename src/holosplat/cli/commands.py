@@ -18,7 +18,7 @@ from .light import RunLightFlags
 from .options import BeamlineOptions, MethodOptions, PriorOptions
 from .places import Output
 from .progress import ProgressBar
-from .sentence import INTERRUPTED, interruptible, say, tell_frames, tell_reconstruction
+from .sentence import INTERRUPTED, cut_off, interruptible, say, tell_frames, tell_reconstruction
 from .simulate import TruthOptions
 from .view import LiveFlags, watched
 
@@ -162,7 +162,8 @@ def reconstruct(
             if reconstruct_in_motion(scan, reading, prior, folder, told, resume=resume):
                 return
     with claimed(folder):
-        with ProgressBar() as bar, watched(live, out.name, bar.show) as follow:
+        kept = interruptible(lambda: cut_off(folder))
+        with kept, ProgressBar() as bar, watched(live, out.name, bar.show) as follow:
             told = {"on_progress": follow.on_progress, "on_state": follow.on_state}
             result = fit(measured, prior, method, seed, folder=folder, resume=resume, **ways, **told)
         report = scored(folder, result, measured, scan, reading)

@@ -30,12 +30,13 @@ from ..workflows.reconstruction import Reconstruction, instants_of, reconstructi
 from ..workflows.rehearsal import rehearse
 from ..workflows.run_folder import RunFolder, claimed
 from .progress import ProgressBar
-from .sentence import put, say, tell_result
+from .sentence import interruptible, put, say, tell_result
 
 if TYPE_CHECKING:
     from ..report.compare import Side
 
 
+KEPT = "interrupted; the rehearsals that are done are kept, and the same command goes on"
 TRUTH = "truth"
 """The file of source.json by which a run was evaluated, for pages that are written again."""
 
@@ -150,13 +151,13 @@ def _known_truth(folder: RunFolder, result: Reconstruction) -> Volume | None:
 def judge(run: Path, scan: Path | None, truth: Path | None, as_json: bool, reading: Reading) -> None:
     """Print the scores of a run, by a truth, too, and renew its report by that."""
     folder = RunFolder(run)
+    result, measured = run_and_scan(folder, scan, reading)
     predicted = scan is None and folder.path.resolve() in folder.source_scan().resolve().parents
     require(
         not predicted or truth is not None,
         f"{run} is a forecast of times without frames, so that only its own predictions could score it; name frames by "
         "--scan, or a --truth.",
     )
-    result, measured = run_and_scan(folder, scan, reading)
     true_volume = read_volume_file(truth, result.delta_told) if truth else None
     if truth is not None and true_volume is not None:
         require_same_field(true_volume.grid, measured.views, truth)
@@ -215,7 +216,7 @@ def _rehearse(folder: RunFolder, times: int, bins: int | None, reading: Reading)
         method = Settled.again(method, config["decided"]).method
         prior, seed = prior_of(config["prior"]), int(config["seed"])
     with claimed(folder):
-        with ProgressBar() as bar:
+        with interruptible(lambda: KEPT), ProgressBar() as bar:
             how = {"times": times, "bins": bins, "seed": seed, "folder": folder, "on_progress": bar.show}
             found = rehearse(result, measured, prior, method, **how)
         truth = _known_truth(folder, result)

@@ -51,6 +51,12 @@ def interruptible(sentence: Callable[[], str]) -> Iterator[None]:
         raise SystemExit(INTERRUPTED) from None
 
 
+def cut_off(folder: RunFolder) -> str:
+    """How a run goes on that was interrupted before its end."""
+    begun = folder.config.is_file()
+    return f"interrupted; {f'go on with --resume {folder.path}' if begun else 'nothing was kept yet, so begin anew'}"
+
+
 def give_up(sentence: str) -> NoReturn:
     """Say `sentence` on standard error, and end with 2."""
     text = f"holosplat: {sentence}\n"

@@ -47,7 +47,7 @@ from .options import PriorOptions
 from .places import Output
 from .progress import ProgressBar
 from .scans import report_of_middle, report_run, run_and_scan
-from .sentence import interruptible, put, say, tell_frames, tell_result
+from .sentence import cut_off, interruptible, put, say, tell_frames, tell_result
 
 
 @checked_dataclass
@@ -154,7 +154,7 @@ def track(
             "--body FILE helps."
         )
     prior = matter.prior(measured.exposures.reference_energy, reading.told.wall)
-    with interruptible(lambda: _cut_off(folder)), ProgressBar() as bar:
+    with interruptible(lambda: cut_off(folder)), ProgressBar() as bar:
         told = {"light": illumination.options(), "folder": folder, "resume": resume, "on_progress": bar.show}
         told |= {"after": before}
         result = follow(measured, prior, options, seed, **told)
@@ -172,10 +172,6 @@ def _scored(folder: RunFolder, result: Reconstruction, measured: Scan, scan: Pat
     evaluation = score(result, measured, None)
     write_times(folder.path / TIMES, result, measured, evaluation.light)
     return evaluation
-
-
-def _cut_off(folder: RunFolder) -> str:
-    return f"interrupted{f'; go on with --out {folder.path} --resume' if folder.checkpoint.is_file() else ''}"
 
 
 FEWEST_TIMES = 3
@@ -214,7 +210,7 @@ def reconstruct_in_motion(
         return _still(f"motion is asked of frames of {FEWEST_TIMES} times or more, but there are {count}")
     tell_frames("matter in motion", train, folder.path, lambda seen: of_motion(seen, options))
     measured = planned.in_memory()
-    with interruptible(lambda: _cut_off(folder)), ProgressBar() as bar:
+    with interruptible(lambda: cut_off(folder)), ProgressBar() as bar:
         told = {"light": light, "folder": folder, "resume": resume, "on_progress": bar.show}
         found = reconstruct_moving(measured, prior, options, seed, **told)
     if found is None:

@@ -9,6 +9,7 @@ from ..checks import InputError, as_written, require
 from ..io.atomic import atomic_path, read_json, require_writable
 from ..io.facts import Facts, facts_of_matter, no_kind
 from ..io.formats import loader_of
+from ..io.provenance import origin
 from ..io.reading import Reading
 from ..memory import uncollected
 from ..units import beam_named, in_percent, number_of
@@ -121,7 +122,9 @@ def _of_run(folder: RunFolder) -> Facts:
     scan = source or "SCAN"
     commands = []
     if not done:
-        commands.append(f"holosplat reconstruct {scan} --out {folder.path} --resume, with the options of before")
+        act = str(origin(folder.path).get("command", "")).split()[1:2]
+        again = f"holosplat reconstruct {scan} --out {folder.path} --resume, with the options of before"
+        commands.append(f"holosplat {act[0]} --resume {folder.path}" if act else again)
     if object_there:
         commands += [
             f"holosplat evaluate {folder.path} --truth VOLUME",
