@@ -92,7 +92,7 @@ def beam_named(energies_kev: np.ndarray | float) -> tuple[str, str]:
         return "photon energy", f"{span(energies)} keV"
     lengths = wavelength(energies)
     unit, factor = ("pm", 1e12) if lengths.max() < 1e-9 else length_unit(float(lengths.max()))
-    return "wavelength in the medium", f"{span(factor * lengths)} {unit}"
+    return "wavelength in medium", f"{span(factor * lengths)} {unit}"
 
 
 def plain(value: float, digits: int = 3) -> str:

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from ..motion.flow_reconstruction import FlowOptions
     from ..series.plan import Settings
     from ..workflows.reconstruct import Reconstruction
+    from ..workflows.verdict import Verdict
 
 
 @checked_dataclass
@@ -166,11 +167,11 @@ def reconstruct(
         with kept, ProgressBar() as bar, watched(live, out.name, bar.show) as follow:
             told = {"on_progress": follow.on_progress, "on_state": follow.on_state}
             result = fit(measured, prior, method, seed, folder=folder, resume=resume, **ways, **told)
-        report = scored(folder, result, measured, scan, reading)
+        report, held_out = scored(folder, result, measured, scan, reading)
     tell_found(folder, result, report)
     if reading.part.time_frame == "still" and result.verdict is not None and not result.verdict.good:
         say("all times were taken for one object that stands still; if it moves, name another --motion, such as each")
-    _end(result, out, strict)
+    _end(result, out, strict, held_out)
 
 
 def _with_motion(scan: Path, out: Path, asked: Asked, reading: Reading, seed: int, resume: bool) -> Asked:
@@ -213,11 +214,13 @@ def _time_by_time(scan: Path, out: Path, asked: Asked, reading: Reading, seed: i
         reconstruct_each(scan, out, asked.each_time(method, reading, seed), asked.matter.prior, reading, resume)
 
 
-def _end(result: Reconstruction, out: Path, strict: bool) -> None:
-    """Warn of what is not explained or not finished; exit with 3 or 130 where that is so."""
+def _end(result: Reconstruction, out: Path, strict: bool, held_out: Verdict | None) -> None:
+    """Warn of what is not explained or not finished; exit with 3 or 130 where that is so of the training frames."""
     unexplained = result.verdict is not None and not result.verdict.good
     if unexplained:
         say("warning: the frames are not explained; do not trust the volume before the cause is found")
+    elif held_out is not None and not held_out.good:
+        say("warning: held-out frames are not explained, only those of the fit; do not trust the volume between these")
     if not result.finished:
         say(f"interrupted, but {out} is usable; go on with --resume")
         raise SystemExit(INTERRUPTED)

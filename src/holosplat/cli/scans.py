@@ -29,6 +29,7 @@ from ..workflows.reconstruct import load_reconstruction
 from ..workflows.reconstruction import Reconstruction, instants_of, reconstruction_at, where_found
 from ..workflows.rehearsal import rehearse
 from ..workflows.run_folder import RunFolder, claimed
+from ..workflows.verdict import Verdict
 from .progress import ProgressBar
 from .sentence import interruptible, put, say, tell_result
 
@@ -100,8 +101,11 @@ def report_of_middle(folder: RunFolder, result: Reconstruction, measured: Scan) 
     return report_run(folder, now, shown, evaluate(now, shown, None), None, whole)
 
 
-def scored(folder: RunFolder, result: Reconstruction, measured: Scan, scan: Path, reading: Reading) -> Path:
-    """Print the scores of a run on its frames, and write its report; the folder then knows where its frames are."""
+def scored(
+    folder: RunFolder, result: Reconstruction, measured: Scan, scan: Path, reading: Reading
+) -> tuple[Path, Verdict | None]:
+    """Print the scores of a run on its frames, and write its report; the folder then knows where its frames are. The
+    report, and the verdict on held-out frames."""
     found = reading.told.found({each.name: each.value for each in result.constants})
     folder.write_source(run_source(scan, replace(reading, told=found)))
     placed = result.placed(measured)
@@ -112,8 +116,8 @@ def scored(folder: RunFolder, result: Reconstruction, measured: Scan, scan: Path
         each = result.placed(read_frames(scan, every)).in_memory()
         write_times(folder.path / TIMES, result, each, evaluation.light)
     if instants_of(folder):
-        return report_of_middle(folder, result, placed)
-    return report_run(folder, result, placed, evaluation, None)
+        return report_of_middle(folder, result, placed), evaluation.verdict
+    return report_run(folder, result, placed, evaluation, None), evaluation.verdict
 
 
 def tell_found(folder: RunFolder, result: Reconstruction, report: Path) -> None:
