@@ -179,7 +179,7 @@ def judge(run: Path, scan: Path | None, truth: Path | None, as_json: bool, readi
     elif true_volume is not None or not folder.report.exists():
         with claimed(folder):
             if truth is not None and folder.source.is_file():
-                folder.write_source(read_json(folder.source) | {TRUTH: str(truth.resolve())})
+                folder.write_source({**read_json(folder.source), TRUTH: str(truth.resolve())})
             say(f"report: {report_run(folder, result, measured, evaluation, true_volume)}")
 
 
