@@ -18,7 +18,15 @@ from .light import RunLightFlags
 from .options import BeamlineOptions, MethodOptions, PriorOptions
 from .places import Output
 from .progress import ProgressBar
-from .sentence import INTERRUPTED, cut_off, interruptible, say, tell_frames, tell_reconstruction
+from .sentence import (
+    INTERRUPTED,
+    cut_off,
+    interruptible,
+    say,
+    say_that_libraries_load,
+    tell_frames,
+    tell_reconstruction,
+)
 from .simulate import TruthOptions
 from .view import LiveFlags, watched
 
@@ -265,6 +273,7 @@ def evaluate(
         truth: Volume file of the truth, of any format that export --volume writes.
         as_json: Print JSON instead of a table.
     """
+    say_that_libraries_load()
     from .scans import judge
 
     judge(run, scan, truth, as_json, reading)
