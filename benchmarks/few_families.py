@@ -57,7 +57,8 @@ def row(data: Path, scene: int, views: int, method: str) -> Row:
     """What `method` makes of one time in so many views."""
     given = espresso(data, scene, views)
     began = time.perf_counter()
-    result = hs.reconstruct(given.scan, given.prior, METHODS[method].options, matter="levels")
+    options = METHODS[method].options
+    result = hs.reconstruct(given.scan, given.prior, options, matter=options.kinds_of_matter[0])
     seconds = time.perf_counter() - began
     scored = hs.evaluate(result, given.scan, given.scene.voxelise(Grid.of_views(given.scan.views)))
     assert scored.volume is not None

@@ -45,6 +45,12 @@ def test_what_is_told_of_the_sign_is_known():
     assert prior_of(MaterialPrior.known(DeltaBeta(-1e-7, 0.0), medium="oil").as_dict()).medium == "oil"
 
 
+@pytest.mark.parametrize(("index", "name"), [((float("nan"), 0.0), "δ"), ((1e-7, float("-inf")), "β")])
+def test_an_index_is_finite(index, name):
+    with pytest.raises(InputError, match=f"{name} must be a finite number, but it is"):
+        DeltaBeta(*index)
+
+
 def test_several_materials_are_the_same_in_a_file():
     first, near, last = DeltaBeta(9e-7, 2e-9), DeltaBeta(8.6e-7, 1e-9), DeltaBeta(2e-7, 1e-10)
     several = MaterialPrior.known(last, near, first)

@@ -15,6 +15,7 @@ from holosplat.units import (
     LENGTH_UNITS,
     TIME_UNITS,
     in_percent,
+    number_of,
     plain,
     two_digits,
     unit_factor,
@@ -77,3 +78,10 @@ def test_capitals_of_short_units_matter(unit, table):
 )
 def test_numbers_have_three_digits_and_no_exponent(value, said):
     assert plain(value) == said
+
+
+@pytest.mark.parametrize(
+    ("count", "noun", "said"), [(1, "body", "1 body"), (2, "body", "2 bodies"), (0, "time", "0 times")]
+)
+def test_a_number_of_things_has_their_plural(count, noun, said):
+    assert number_of(count, noun) == said

@@ -19,9 +19,9 @@ from holosplat.report.style import (
     HOLOGRAM_MAP,
     INK,
     RECONSTRUCTION,
+    around_zero,
     colour_bar,
     decimal_scale,
-    from_dark,
     image_panel,
     letter,
     new_figure,
@@ -86,14 +86,15 @@ def _banner_slices(
 ) -> AxesImage:
     grid, planes = reconstruction.grid, richest_planes(truth or reconstruction)
     scale, _ = decimal_scale(material)
-    limits = value_limits([v.delta / scale for v in (reconstruction, truth) if v is not None])
+    shown = [v.delta / scale for v in (reconstruction, truth) if v is not None]
+    colours, limits = around_zero(DELTA_MAP, value_limits(shown))
     if truth is None:
         panels = [place(6.6, 0.05, 2.8, 2.8)]
         letter(panels[0], 2, "Slice of δ")
-        return slice_row(panels, reconstruction.delta / scale, grid, planes, from_dark(DELTA_MAP, limits), limits)
+        return slice_row(panels, reconstruction.delta / scale, grid, planes, colours, limits)
     for i, (name, volume) in enumerate((("truth", truth), ("reconstruction", reconstruction))):
         panels = [place(left, 1.56 - 1.51 * i, 1.29, 1.29) for left in (6.72, 8.11)]
-        drawn = slice_row(panels, volume.delta / scale, grid, planes, from_dark(DELTA_MAP, limits), limits)
+        drawn = slice_row(panels, volume.delta / scale, grid, planes, colours, limits)
         letter(panels[0], 2 + i, f"Slices of δ, {name}")
     return drawn
 

@@ -16,6 +16,7 @@ import torch
 
 from . import native
 from .checks import InputError, MissingError, require
+from .units import number_of
 
 Backend = Literal["auto", "cpu", "cuda", "reference"]
 """What may be asked to compute."""
@@ -134,4 +135,5 @@ def device_name(backend: str) -> str:
     """The device in words, for the record of a run."""
     if backend == "cuda":
         return "Triton's interpreter" if interpreted() else torch.cuda.get_device_name()
-    return f"CPU, {torch.get_num_threads()} threads" + (f", {native.used_isa()}" if backend == "cpu" else "")
+    threads = number_of(torch.get_num_threads(), "thread")
+    return f"CPU, {threads}" + (f", {native.used_isa()}" if backend == "cpu" else "")

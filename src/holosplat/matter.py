@@ -25,8 +25,15 @@ RATIO_RANGE = (1.0, 1e6)
 """Sizes of δ/β that may be given."""
 
 
-class DeltaBeta(NamedTuple):
+class _Index(NamedTuple):
+    delta: float
+    beta: float
+
+
+class DeltaBeta(_Index):
     """The refractive index n = 1 - delta + i·beta, dimensionless; either may be negative in a difference.
+
+    Errors: `InputError` for numbers that are not finite.
 
     Examples:
 
@@ -37,8 +44,14 @@ class DeltaBeta(NamedTuple):
         δ 1.6e-07, β -4.0e-11, δ/β -4000
     """
 
-    delta: float
-    beta: float
+    __slots__ = ()
+
+    def __new__(cls, delta: float, beta: float) -> Self:
+        """δ and β, both finite."""
+        for name, value in (("δ", delta), ("β", beta)):
+            finite = math.isfinite(value)
+            require(finite, f"{name} must be a finite number, but it is {value}; correct it.")
+        return super().__new__(cls, delta, beta)
 
     def against(self, medium: DeltaBeta) -> DeltaBeta:
         """What an object in `medium` adds to it: `(δ - δ_medium, β - β_medium)`."""

@@ -92,13 +92,19 @@ def beam_named(energies_kev: np.ndarray | float) -> tuple[str, str]:
         return "photon energy", f"{span(energies)} keV"
     lengths = wavelength(energies)
     unit, factor = ("pm", 1e12) if lengths.max() < 1e-9 else length_unit(float(lengths.max()))
-    return "wavelength", f"{span(factor * lengths)} {unit}"
+    return "wavelength in medium", f"{span(factor * lengths)} {unit}"
 
 
 def plain(value: float, digits: int = 3) -> str:
     """`value` to so many digits, or to a whole number where that has more; without exponent, 0 without sign."""
     rounded = np.rint(value) if abs(value) >= 10**digits - 0.5 else float(f"{value:.{digits}g}")
     return np.format_float_positional(rounded + 0.0, trim="-")
+
+
+def number_of(count: int, noun: str) -> str:
+    """A number of things: 1 body, 2 bodies."""
+    several = f"{noun[:-1]}ies" if noun.endswith("y") else f"{noun}s"
+    return f"{count} {noun if count == 1 else several}"
 
 
 def two_digits(value: float) -> str:

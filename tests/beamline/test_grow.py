@@ -142,7 +142,7 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     options = "--cells 1 --box 15e-6 15e-6 12e-6 --flow 0.01 --snapshots 2 --interval 2e-6 --frequency 3"
     monkeypatch.setattr(sys, "argv", ["holosplat", "grow", "--out", str(out), *options.split()])
     main()
-    assert "2 snapshots of 1 cells" in capsys.readouterr().err
+    assert "2 snapshots of 1 cell" in capsys.readouterr().err
     assert SeriesFolder(out).file(0, 1).is_file()
 
 

@@ -56,9 +56,9 @@ def test_the_wave_travels_in_the_medium_and_its_phase_is_that_of_the_difference_
     [
         (20.0, ("photon energy", "20 keV")),
         (np.array([15.0, 24.0]), ("photon energy", "15 to 24 keV")),
-        (LIGHT, ("wavelength", "398.8 nm")),
-        (photon_energy(10.6e-6), ("wavelength", "10.6 µm")),
-        (photon_energy(1.97e-12), ("wavelength", "1.97 pm")),
+        (LIGHT, ("wavelength in medium", "398.8 nm")),
+        (photon_energy(10.6e-6), ("wavelength in medium", "10.6 µm")),
+        (photon_energy(1.97e-12), ("wavelength in medium", "1.97 pm")),
     ],
 )
 def test_a_beam_is_named_in_the_unit_that_suits(said, text):
@@ -80,7 +80,7 @@ def test_what_is_said_of_light_goes_before_the_file(tmp_path: Path):
     found = read_as(tmp_path / "s.nxs", told).exposures
     assert wavelength(found.energy_kev) == pytest.approx([VACUUM_M / MEDIUM] * 2, rel=1e-12)
     rows = facts_of_scan(loader_of(tmp_path / "s.nxs"), tmp_path / "s.nxs", told).facts.rows
-    assert (rows["wavelength"], "photon energy" in rows) == ("398.8 nm", False)
+    assert (rows["wavelength in medium"], "photon energy" in rows) == ("398.8 nm", False)
 
 
 @pytest.mark.parametrize(

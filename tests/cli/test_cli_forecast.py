@@ -146,6 +146,24 @@ def test_frames_that_were_held_out_judge_it(folder):
     assert said["train"]["mean"]["ssim"] == pytest.approx(judged["ssim"], abs=0.05)
 
 
+def test_a_forecast_is_not_scored_by_its_own_predictions(folder, tmp_path):
+    """Of times of which the scan has no frames."""
+    with undrawn():
+        how = ("--no-half-sets", "--times", 1, "--step", 0.1 * STEP, "--out", tmp_path / "beyond")
+        worked_by("forecast", folder / "run", *how)
+    refused(holosplat("evaluate", tmp_path / "beyond"), "only its own predictions", "--truth")
+    worked_by("export", folder / "run", "--volume", tmp_path / "truth.h5")
+    said = json.loads(worked_by("evaluate", tmp_path / "beyond", "--truth", tmp_path / "truth.h5", "--json").out)
+    assert said["train"] is None
+    assert said["volume"] is not None
+
+
+def test_a_run_of_several_times_is_not_rehearsed(folder):
+    refused(holosplat("rehearse", folder / "run"), "matter at one time", "several")
+    assert "rehearse" not in worked_by("info", folder / "run").out
+    assert "No rehearsal" not in (folder / "later" / "report.html").read_text(encoding="utf-8")
+
+
 def test_a_forecast_that_was_cut_off_goes_on(folder, monkeypatch):
     """--resume alone gives the same bodies, and refuses the folder of another run."""
     out = folder / "again"

@@ -126,18 +126,29 @@ def test_gaps_and_noise_and_counts_are_seen(tmp_path):
     kept = scan[np.r_[0:8, 12:20]]
     write_scan(tmp_path / "gap.nxs", kept)
     found = rows(tmp_path / "gap.nxs")
-    assert found["steps"] == ["9°, 1 gaps: 63° to 108°"]
+    assert found["steps"] == ["9°, 1 gap: 63° to 108°"]
     noise = float(found["noise"][0].split(" %")[0])
     assert noise == pytest.approx(100 / np.sqrt(200), rel=0.4)
     counts = tmp_path / "counts.npz"
     angles = np.linspace(0, 180, len(kept), endpoint=False)
     beam = {"energy_kev": 15.0, "distance": 0.12, "pixel_size": 1e-6}
     np.savez(counts, counts=(900 * kept.frames).astype(np.uint16), angles_deg=angles, **beam)
-    assert "that nothing divides" in rows(counts)["missing"][0]
+    assert "divide counts by their flats" in rows(counts)["missing"][0]
+    np.savez(counts, counts=kept.frames / 900, angles_deg=angles, **beam)
+    assert "none for frames that were divided before" in rows(counts)["missing"][0]
     flats = np.full((2, *kept.views.shape), 900, np.uint16)
     np.savez(counts, counts=(900 * kept.frames).astype(np.uint16), flats=flats, angles_deg=angles, **beam)
     assert "missing" not in rows(counts)
     assert "16 projections of 25 × 28 pixels (rows × columns), 2 flats" in rows(counts)["frames"]
+
+
+def test_values_of_other_files_are_read_where_that_is_allowed(shop, tmp_path):
+    shutil.copy(shop.scan, tmp_path / "other.h5")
+    with h5py.File(shutil.copy(shop.scan, tmp_path / "scan.nxs"), "a") as file:
+        del file["entry/data/data"]
+        file["entry/data/data"] = h5py.ExternalLink("other.h5", "/entry/data/data")
+    refused(holosplat("info", tmp_path / "scan.nxs"), "add --allow-external")
+    worked(holosplat("info", tmp_path / "scan.nxs", "--allow-external"))
 
 
 def test_the_air_is_found(tmp_path):

@@ -16,6 +16,7 @@ import pytest
 from helpers.cli import COLUMNS, PIXEL, QUICK, ROWS, holosplat, known, refused, worked
 from holosplat.cli.progress import ProgressBar
 from holosplat.fit.problem import Schedule
+from holosplat.fit.run import Run
 from holosplat.geometry import Grid
 from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.io.volumes import read_volume
@@ -165,5 +166,21 @@ def test_ctrl_c_during_the_start_leaves_nothing(shop, tmp_path, monkeypatch):
     monkeypatch.setattr("holosplat.workflows.reconstruct.reconstruct", pressed)
     outcome = holosplat("reconstruct", shop.scan, "--out", tmp_path / "run", *known(shop))
     assert outcome.code == 130
-    assert outcome.err.strip().splitlines()[-1] == "holosplat: interrupted"
+    assert outcome.err.strip().splitlines()[-1] == "interrupted; nothing was kept yet, so begin anew"
     assert list(tmp_path.iterdir()) == []
+
+
+def test_ctrl_c_between_fits_says_how_the_run_goes_on(shop, tmp_path):
+    keep = Run.keep
+
+    def pressed(run: Run) -> None:
+        keep(run)
+        raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Run, "keep", pressed)
+        outcome = holosplat("reconstruct", shop.scan, "--out", tmp_path / "run", *known(shop))
+    assert outcome.code == 130
+    assert outcome.err.strip().splitlines()[-1] == f"interrupted; go on with --resume {tmp_path / 'run'}"
+    assert f"holosplat reconstruct --resume {tmp_path / 'run'}" in worked(holosplat("info", tmp_path / "run")).out
+    worked(holosplat("reconstruct", "--resume", tmp_path / "run"))

@@ -57,6 +57,32 @@ def test_intervals_are_printed_and_kept(run, monkeypatch):
     assert trusted[table["word"]] in compared
 
 
+def test_a_volume_that_was_told_levels_once_is_rehearsed(run, tmp_path, monkeypatch):
+    """As older versions let it be."""
+    monkeypatch.setattr(certainty, "MISTAKES", {})
+    mine = tmp_path / "run"
+    few = ("--method", "volume", "--set", "volume.iterations=4", "--set", "iterations=2", "--material", "water")
+    worked(holosplat("reconstruct", run.parent / "scan.nxs", *few, "--out", mine))
+    summary = read_json(mine / "summary.json")
+    write_json(mine / "summary.json", summary | {"decided": summary["decided"] | {"matter": "levels"}})
+    worked(holosplat("rehearse", mine, "--times", 2))
+
+
+def test_a_page_keeps_the_truth_by_which_the_run_was_evaluated(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(certainty, "MISTAKES", {})
+    mine, page = tmp_path / "run", tmp_path / "run/report.html"
+    shutil.copytree(run, mine)
+    done = hs.load_reconstruction(hs.RunFolder(mine))
+    hs.write_volume(tmp_path / "truth.h5", done.object.voxelise(hs.Grid.of_views(hs.read(mine).views)))
+    said = "a Dice coefficient of 1.000"
+    worked(holosplat("evaluate", mine, "--truth", tmp_path / "truth.h5"))
+    for there in (True, False):
+        assert said in page.read_text(encoding="utf-8")
+        worked(holosplat("rehearse", mine, "--times", 2))
+        assert (said in page.read_text(encoding="utf-8")) == there
+        (tmp_path / "truth.h5").unlink(missing_ok=True)
+
+
 def test_all_times_of_a_series_are_rehearsed_and_those_that_began_warm_from_their_frames_alone(
     run, tmp_path, monkeypatch
 ):

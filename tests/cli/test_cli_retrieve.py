@@ -110,5 +110,11 @@ def test_counts_are_refused(shop, tmp_path):
     scan = read_scan(shop.scan)
     write_scan(tmp_path / "counts.nxs", hs.Scan(3000 * scan.frames[:], scan.exposures, scan.is_test))
     for act in ("retrieve", "align"):
-        refused(holosplat(act, tmp_path / "counts.nxs", *MATTER, "--out", tmp_path / "out.nxs"), "--flats", "median")
-    assert not (tmp_path / "out.nxs").exists()
+        refused(holosplat(act, tmp_path / "counts.nxs", *MATTER, "--out", tmp_path / "out.nxs"), "--flats", "level")
+    counted = read_scan(tmp_path / "counts.nxs")
+    with pytest.raises(hs.InputError, match=r"relative to the flat field.*level"):
+        hs.retrieve(counted.frames, counted.exposures, hs.DeltaBeta(5.8e-7, 2.6e-10))
+    for out in ("out.nxs", "images"):
+        to = () if out.endswith("nxs") else ("--to", "tiff")
+        refused(holosplat("convert", tmp_path / "counts.nxs", tmp_path / out, *to), "--flats", "level")
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["counts.nxs"]

@@ -109,6 +109,9 @@ def test_one_time_of_a_series_is_reconstructed_and_judged(folder, tmp_path, monk
         holosplat("reconstruct", tmp_path / "s.nxs", "--out", tmp_path / "run", *known, "--time-frame", 4),
         "from 0 to 3, but 4",
     )
+    for words in (["series", "plan"], ["reconstruct", "--motion", "each"], ["reconstruct", "--time-frame", 1]):
+        impossible = ["--material", "haemoglobin", "--method", "volume", "--matter", "levels"]
+        refused(holosplat(*words, tmp_path / "s.nxs", "--out", tmp_path / "run", *impossible), "volume has no levels")
     assert everything_in(tmp_path) == before
     worked(holosplat("reconstruct", tmp_path / "s.nxs", "--out", tmp_path / "run", *known, "--time-frame", 2))
     scored = json.loads(

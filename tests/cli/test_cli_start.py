@@ -10,13 +10,16 @@ import sys
 import pytest
 
 from helpers.cli import holosplat, worked
-from holosplat.cli.entry import COMMANDS, command
+from holosplat.cli.entry import COMMANDS, LATE, command
 
 HEAVY = ("torch", "scipy", "h5py", "xraydb", "vtk", "vtkmodules", "matplotlib", "jinja2", "tifffile", "PIL", "triton")
 LIGHT = (
     *([], ["plan"], ["simulate"], ["reconstruct"], ["render"], ["export"], ["evaluate"], ["demo"], ["backends"]),
     *(["bench"], ["bench", "run"], ["bench", "report"], ["bench", "thesis"]),
 )
+IN_A_TENTH = {"h5py", "tifffile", "PIL", "jinja2"}
+"""What other commands than `LIGHT` may load, which takes a tenth of a second."""
+OTHERS = [name for name, (module, _) in COMMANDS.items() if module not in LATE and [name] not in LIGHT]
 
 
 def loaded(arguments: list[str]) -> tuple[str, list[str]]:
@@ -35,6 +38,23 @@ def test_help_loads_nothing_heavy(arguments):
     said, heavy = loaded(arguments)
     assert heavy == []
     assert f"holosplat {' '.join(arguments)}".strip() in said
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_help_takes_no_seconds(name):
+    assert IN_A_TENTH.issuperset(loaded([name])[1])
+
+
+def test_the_first_line_comes_before_what_takes_seconds_to_load(tmp_path):
+    """Nothing is loaded where arguments are refused."""
+    (tmp_path / "torch.py").write_text("raise SystemExit('loaded')\n")
+    told = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    for options, code, said in ((["--out", "run"], 1, "loading libraries …\nloaded\n"), ([], 2, "--out")):
+        command = [sys.executable, "-m", "holosplat", "reconstruct", str(tmp_path), *options]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, env=told, cwd=tmp_path)
+        assert done.returncode == code
+        assert said in done.stderr
+        assert "loaded" in done.stderr or code == 2
 
 
 def test_nothing_is_searched_for_garbage_in_the_end():

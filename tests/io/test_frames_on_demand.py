@@ -184,7 +184,7 @@ def test_values_that_are_no_numbers_are_filled_and_said(stored, caplog):
     assert not caplog.records
     around = np.delete(whole[1:4, 4:7].ravel(), 4)
     np.testing.assert_allclose(scan[[3]].frames[0, 2, 5], around.mean(), rtol=1e-6)
-    assert "1 pixels in 1 of 1 frames" in caplog.text
+    assert "(1 in 1 of 1 frames)" in caplog.text
 
 
 def test_picked_and_binned_frames_can_be_stacked(stored):

@@ -16,7 +16,7 @@ from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError, NoMatterError
 from holosplat.geometry import Grid, Views
 from holosplat.inference import Decision, Score
-from holosplat.matter import DeltaBeta, MaterialPrior, Matter
+from holosplat.matter import DeltaBeta, MaterialPrior, Matter, MatterKind
 from holosplat.methods import Auto, Gaussians, Method, Task, settled
 from holosplat.methods.cross_validation import MissingMatter, plain_light
 from holosplat.methods.levels import (
@@ -30,12 +30,14 @@ from holosplat.methods.levels import (
 from holosplat.methods.method import first_of_task
 from holosplat.methods.trials import WITHOUT
 from holosplat.methods.uncertain import Determined
+from holosplat.methods.volume import SmoothVolume
 from holosplat.optics.background import LightOptions
 from holosplat.representations import Stored, VoxelGrid
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.red_cells import random_cells
 from holosplat.specimens.scene import MeshScene
 from holosplat.specimens.soft_matter import soft_cells
+from holosplat.workflows.reconstruct import reconstruct
 
 pytestmark = pytest.mark.usefixtures("begun_once")
 
@@ -261,9 +263,28 @@ def test_too_few_views_are_said(sharp):
 
 def test_the_kind_that_is_told_is_taken(sharp):
     assert settled(SMALL, Task(sharp, KNOWN), "continuous").matter == "continuous"
-    two = MaterialPrior.known(DeltaBeta(2e-7, 1e-10), DeltaBeta(1e-7, 1e-10))
-    with pytest.raises(InputError, match="--matter must be levels or auto where several materials are known"):
-        settled(SMALL, Task(sharp, two), "continuous")
+
+
+@pytest.mark.parametrize(
+    ("method", "prior", "told", "why"),
+    [
+        (
+            SMALL,
+            MaterialPrior.known(MATERIAL, DeltaBeta(1e-7, 1e-10)),
+            "continuous",
+            "several materials",
+        ),
+        (SMALL, RATIO.on_both_sides(), "levels", "both sides"),
+        (SmoothVolume(), RATIO, "levels", "the method volume has no levels"),
+    ],
+)
+def test_a_kind_that_there_cannot_be_is_refused_and_the_other_one_taken(sharp, method, prior, told, why):
+    kind: MatterKind = "levels" if told == "continuous" else "continuous"
+    with pytest.raises(InputError, match=f"--matter must be {kind} or auto, because .*{why}.*, but it is {told}"):
+        reconstruct(sharp, prior, method, matter=told)
+    decided = settled(method, Task(sharp, prior))
+    assert decided.matter == kind
+    assert why in decided.decision.by
 
 
 def test_fits_of_gaussians_decide_the_kind_of_a_known_material(soft, monkeypatch):

@@ -162,6 +162,12 @@ def test_both_sides_are_taken_where_they_predict_unseen_frames(scan):
     assert found.prior.sign == -1
 
 
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_a_side_that_is_told_is_kept(scan, sign):
+    told = MaterialPrior.of_ratio(WATER.ratio).signed(sign)
+    assert prepared(Task(scan, told), SmoothVolume()).prior == told
+
+
 def test_a_run_that_goes_on_keeps_both_sides(scan):
     task = prepared(Task(scan, MaterialPrior.of_ratio(WATER.ratio)), SmoothVolume())
     assert task.prior.two_sided

@@ -196,6 +196,18 @@ def test_negative_contrast_is_drawn():
         assert len(picture) > 20_000
 
 
+@pytest.mark.parametrize(("other", "colours"), [(-0.5, "RdBu_r"), (-1e-4, "magma"), (-3.0, "RdBu_r")])
+def test_matter_on_both_sides_of_its_medium_is_drawn_around_white(other, colours):
+    """Less of it than one colour stands for is rounding."""
+    found, _ = scene()
+    values = found.delta + np.roll(found.delta, len(found.delta) // 2, axis=0) * other
+    both = Volume(values, found.beta, found.grid)
+    image = slices_figure(both, None, richest_planes(both)).axes[0].images[0]
+    assert image.get_cmap().name == colours
+    low, high = image.get_clim()
+    assert (low == -high) == (colours == "RdBu_r")
+
+
 def test_equal_content_gives_equal_pages_and_leaves_matplotlib_alone(bare_page):
     before = dict(matplotlib.rcParams)
     assert render_page(content(**BARE)) == bare_page

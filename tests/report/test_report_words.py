@@ -87,6 +87,7 @@ def test_rehearsals_give_the_headline_one_of_three_words():
     assert shown.text == VERDICTS["consistent"]
     assert good.words in shown.words  # whole, for the headline says no noise
     assert NOT_REHEARSED in headline(content(explained=good)).words
+    assert NOT_REHEARSED not in headline(content(explained=good, at_rest=False)).words
 
 
 # --- absorption alone ---

@@ -55,7 +55,7 @@ def test_a_script_asks_for_what_is_left(fresh, done):
         "gpu:1",
     ]
     out = worked(holosplat("series", "run", fresh.path, "--slurm", *options))
-    assert "2 task(s): 0,2" in out.err
+    assert "2 tasks: 0,2" in out.err
     lines = fresh.script.read_text().splitlines()
     assert lines[0] == "#!/bin/bash"
     asked = {line.removeprefix("#SBATCH ") for line in lines if line.startswith("#SBATCH")}

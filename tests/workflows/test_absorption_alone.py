@@ -206,3 +206,7 @@ def test_a_report_of_contact_frames_shows_what_they_show(tmp_path):
     assert "Projected absorption" in page
     assert "δ is β times the ratio that was told" in page
     assert scores["true_ratio"] == pytest.approx(500)
+    view = json.loads(page.split('class="header">')[1].split("</script>")[0])
+    assert not view["delta_told"]
+    through = 4 * wavenumber(ENERGY) * BETA * BALL[3] * PIXEL  # 2k∫β of the ball's diameter
+    assert view["phase"] == pytest.approx([0, through], rel=0.2)

@@ -53,7 +53,7 @@ METHODS = {
 @pytest.mark.parametrize("name", METHODS)
 def test_every_method_has_a_total_near_the_truth(scan, name):
     """After short fits, to 20 %; the volume of the known material is the same number over its δ."""
-    found = reconstruct(scan, KNOWN, METHODS[name], matter="levels")
+    found = reconstruct(scan, KNOWN, METHODS[name], matter=METHODS[name].kinds_of_matter[0])
     true = CELL.delta * sum(mesh.volume for mesh in scene().meshes)
     assert found.total is not None
     assert found.total.value == pytest.approx(true, rel=0.2, abs=0)
@@ -147,6 +147,7 @@ def test_words():
     expected = "total δ: the frames cannot tell it; between 1.2e-21 and 4.8e-21 m³"
     assert in_words(unsure, "δ") == f"{expected}; the volume itself holds 1e-21"
     assert "between 0 and" in in_words(Total(-1e-21, 1e-21, 1e-21), "β")
+    assert "between 0 and -3e-21" in in_words(Total(-1e-21, 1e-21, -1e-21), "β")
     with pytest.raises(InputError, match="a total must be what reconstruct wrote"):
         TotalMatter.from_dict({"value_m3": 1})
 

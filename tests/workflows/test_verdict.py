@@ -210,15 +210,17 @@ def test_runs_carry_their_verdict(tmp_path, scan):
 
 @pytest.mark.usefixtures("undrawn_reports")
 def test_strict_runs_end_with_3_where_frames_are_not_explained(tmp_path):
-    """Uneven light: with --strict 3; without, when the finished run is resumed, a warning and 0. Even light: 0."""
+    """Uneven light: with --strict 3; without, when the finished run is resumed, a warning and 0. Even light: 0.
+    Of held-out frames alone: a warning, too."""
     method = ["--method", "holographic-tv", "--delta-beta", f"{MATERIAL[0] / MATERIAL[1]:.0f}"]
     method += ["--matter", "continuous", "--decide", "light=even", "noise=white"]
     even = a_scan(soft(3.0))
     modes = smooth_modes(SHAPE, 3)
     light = torch.einsum("vk,khw->vhw", 0.02 * torch.randn(8, 16, generator=torch.Generator().manual_seed(1)), modes)
     uneven = replace(even, frames=(even.frames * light.exp().numpy()).astype(np.float32))
+    unseen = replace(even, frames=np.where(even.is_test[:, None, None], uneven.frames, even.frames))
     outcomes = {}
-    for name, measured in (("even", even), ("uneven", uneven)):
+    for name, measured in (("even", even), ("uneven", uneven), ("unseen", unseen)):
         write_scan(tmp_path / f"{name}.nxs", measured)
         outcomes[name] = holosplat(
             "reconstruct", tmp_path / f"{name}.nxs", "--out", tmp_path / name, *method, "--strict"
@@ -226,8 +228,9 @@ def test_strict_runs_end_with_3_where_frames_are_not_explained(tmp_path):
     assert outcomes["uneven"].code == 3
     assert "warning: the frames are not explained" in outcomes["uneven"].err
     assert "training frames: The frames are not explained" in outcomes["uneven"].out
+    assert "warning: held-out frames are not explained" in worked(outcomes["unseen"]).err
     worked(outcomes["even"])
-    assert "warning" not in outcomes["even"].err
+    assert "warning: the frames" not in outcomes["even"].err
     assert re.search(r"total δ \S+ m³ ± \S+ %", outcomes["even"].out)
     uneven_again = ("reconstruct", tmp_path / "uneven.nxs", "--out", tmp_path / "uneven", *method, "--resume")
     lax = worked(holosplat(*uneven_again))

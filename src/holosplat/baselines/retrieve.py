@@ -14,6 +14,7 @@ from ..matter import DeltaBeta
 from ..optics.background import Light, LightOptions
 from ..optics.retrieval import RETRIEVALS, usual_options
 from ..optics.retrieval.spectra import checked, radian
+from ..preprocess import require_relative
 from ..progress import Advance
 from ..scan import Exposures
 
@@ -49,7 +50,7 @@ def retrieve(
     missing: pixels [V, H, W] bool without a value (`Scan.missing`), which have no weight
 
     Thickness [m] and phase [rad] of the result are tensors [V, H, W]. Errors: `InputError` for another method, a δ that
-    is not above zero, and frames of another shape.
+    is 0, and frames of another shape or not relative to the flat field.
 
     Examples:
 
@@ -67,6 +68,7 @@ def retrieve(
     if method not in RETRIEVALS:
         raise InputError(f"method must be one of {', '.join(RETRIEVALS)}, but it is {method!r}.")
     known = checked(frames, exposures, material.delta)
+    require_relative(known.detach().cpu().numpy())
     found = Light.of(known, light)
     retrieval, how = RETRIEVALS[method], dict[str, Any]()
     if found.background is not None:

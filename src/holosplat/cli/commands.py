@@ -18,7 +18,15 @@ from .light import RunLightFlags
 from .options import BeamlineOptions, MethodOptions, PriorOptions
 from .places import Output
 from .progress import ProgressBar
-from .sentence import INTERRUPTED, interruptible, say, tell_frames, tell_reconstruction
+from .sentence import (
+    INTERRUPTED,
+    cut_off,
+    interruptible,
+    say,
+    say_that_libraries_load,
+    tell_frames,
+    tell_reconstruction,
+)
 from .simulate import TruthOptions
 from .view import LiveFlags, watched
 
@@ -27,6 +35,7 @@ if TYPE_CHECKING:
     from ..motion.flow_reconstruction import FlowOptions
     from ..series.plan import Settings
     from ..workflows.reconstruct import Reconstruction
+    from ..workflows.verdict import Verdict
 
 
 @checked_dataclass
@@ -161,12 +170,15 @@ def reconstruct(
             if reconstruct_in_motion(scan, reading, prior, folder, told, resume=resume):
                 return
     with claimed(folder):
-        with ProgressBar() as bar, watched(live, out.name, bar.show) as follow:
+        kept = interruptible(lambda: cut_off(folder))
+        with kept, ProgressBar() as bar, watched(live, out.name, bar.show) as follow:
             told = {"on_progress": follow.on_progress, "on_state": follow.on_state}
             result = fit(measured, prior, method, seed, folder=folder, resume=resume, **ways, **told)
-        report = scored(folder, result, measured, scan, reading)
+        report, held_out = scored(folder, result, measured, scan, reading)
     tell_found(folder, result, report)
-    _end(result, out, strict)
+    if reading.part.time_frame == "still" and result.verdict is not None and not result.verdict.good:
+        say("all times were taken for one object that stands still; if it moves, name another --motion, such as each")
+    _end(result, out, strict, held_out)
 
 
 def _with_motion(scan: Path, out: Path, asked: Asked, reading: Reading, seed: int, resume: bool) -> Asked:
@@ -209,11 +221,13 @@ def _time_by_time(scan: Path, out: Path, asked: Asked, reading: Reading, seed: i
         reconstruct_each(scan, out, asked.each_time(method, reading, seed), asked.matter.prior, reading, resume)
 
 
-def _end(result: Reconstruction, out: Path, strict: bool) -> None:
-    """Warn of what is not explained or not finished; exit with 3 or 130 where that is so."""
+def _end(result: Reconstruction, out: Path, strict: bool, held_out: Verdict | None) -> None:
+    """Warn of what is not explained or not finished; exit with 3 or 130 where that is so of the training frames."""
     unexplained = result.verdict is not None and not result.verdict.good
     if unexplained:
         say("warning: the frames are not explained; do not trust the volume before the cause is found")
+    elif held_out is not None and not held_out.good:
+        say("warning: held-out frames are not explained, only those of the fit; do not trust the volume between these")
     if not result.finished:
         say(f"interrupted, but {out} is usable; go on with --resume")
         raise SystemExit(INTERRUPTED)
@@ -258,6 +272,7 @@ def evaluate(
         truth: Volume file of the truth, of any format that export --volume writes.
         as_json: Print JSON instead of a table.
     """
+    say_that_libraries_load()
     from .scans import judge
 
     judge(run, scan, truth, as_json, reading)

@@ -4,32 +4,30 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
-import torch
 from tyro.conf import Positional, arg
 
-from ..baselines.retrieve import Retrieved
-from ..baselines.retrieve import retrieve as act
 from ..checks import InputError, require
+from ..frames import evenly
 from ..io.atomic import atomic_path
 from ..io.formats import HDF5_SUFFIXES, WRITERS, loader_of, read_as, read_frames
 from ..io.images import TiffLayout
 from ..io.phase_maps import PhaseMaps, is_file, write_phase_maps
 from ..io.reading import Reading
 from ..matter import DeltaBeta, KnownRatio, MaterialPrior
-from ..methods.method import STAND_IN_RATIO, shows_no_refraction
-from ..optics import retrieve_thickness
 from ..ranges import Metres, Natural, Positive, Signed, checked_dataclass, flag
 from ..scan import Scan
-from ..workflows.preconditions import check_frames
-from ..workflows.run_illumination import FixedPatternOptions, flatfield_corrected
+from ..units import number_of
 from .light import LightFlags
 from .options import OneMaterial, PriorOptions
 from .places import Output
 from .progress import ProgressBar
 from .sentence import say
+
+if TYPE_CHECKING:
+    from ..baselines.retrieve import Retrieved
 
 
 @checked_dataclass
@@ -60,6 +58,9 @@ class EveningOptions:
 
     def applied(self, scan: Scan, prior: MaterialPrior) -> Scan:
         """The scan without such light."""
+        from ..methods.method import STAND_IN_RATIO, shows_no_refraction
+        from ..workflows.run_illumination import FixedPatternOptions, flatfield_corrected
+
         require(self.still_light is not None or self.inside is None, "--inside needs --still-light.")
         if self.still_light is None:
             return scan
@@ -108,7 +109,12 @@ def convert(
         reading.told.wall is None, "--wall is part of models and changes no frames; give it to reconstruct instead."
     )
     scan = read_as(source, reading, joined=False)
-    if remark := loader_of(source).remark(source, scan):
+    loader = loader_of(source)
+    if loader.opens is not None:  # which may hold counts
+        from ..preprocess import require_relative
+
+        require_relative(np.asarray(scan.source[evenly(len(scan), 3)]))
+    if remark := loader.remark(source, scan):
         say(remark)
     prior = matter.prior(scan.exposures.reference_energy)
     takes_material = "material" in writer.takes
@@ -119,13 +125,17 @@ def convert(
     retrieved = partial(_retrieved, scan, prior) if takes_material and prior.fixes_ratio else None
     if warning := writer.write(out, scan, said, retrieved):
         say(warning)
-    say(f"wrote {out}: {to}, {len(scan)} frames of {scan.views.shape[0]} × {scan.views.shape[1]} pixels, "
+    say(f"wrote {out}: {to}, {number_of(len(scan), 'frame')} of {scan.views.shape[0]} × {scan.views.shape[1]} pixels, "
          f"{int(scan.is_test.sum())} of them held out")  # fmt: skip
 
 
 def _retrieved(scan: Scan, prior: MaterialPrior) -> tuple[np.ndarray, float]:
     """Thickness [N, H, W] [m] of a material, by Paganin (2002), and its δ; of δ/β alone such that the greatest
     thickness is half the field's longer side."""
+    import torch
+
+    from ..optics import retrieve_thickness
+
     exposures, views = scan.exposures.optical, scan.views
     delta, beta = (1.0, 1.0 / prior.ratio) if isinstance(prior, KnownRatio) else prior.materials[0]
     refraction = exposures.refraction(delta, beta)
@@ -182,6 +192,9 @@ def retrieve(
         method: tikhonov (through the full wave optics, the most reliable), admm, ctf, paganin, gerchberg-saxton or
             hybrid-input-output; docs/phase_retrieval.md compares them.
     """
+    from ..baselines.retrieve import retrieve as act
+    from ..workflows.preconditions import check_frames
+
     measured = read_frames(scan, reading).in_memory()
     check_frames(measured)
     material, level = matter.at(measured.exposures.reference_energy)
@@ -204,7 +217,7 @@ def retrieve(
     print(f"phase from {low:.4g} to {high + 0.0:.4g} rad (quantiles 1e-4 and 1 - 1e-4); light {words}")
     if not measured.exposures.distance.any():
         say("the frames are in contact: they show absorption, and the phase is what δ/β makes of it")
-    say(f"wrote {out}: {what}, {len(measured)} frames")
+    say(f"wrote {out}: {what}, {number_of(len(measured), 'frame')}")
 
 
 def _preview(path: Path, measured: Scan, found: Retrieved) -> None:

@@ -10,6 +10,7 @@ from tyro.conf import Positional, arg, subcommand
 
 from ..checks import InputError, require
 from ..io.reading import Reading
+from ..units import number_of
 from ..workflows.run_folder import check as look
 from .places import Output, with_checked_arguments
 from .sentence import say
@@ -90,7 +91,7 @@ def check(path: Positional[Path]) -> None:
     count, wrong = look(path)
     if wrong:
         raise InputError("; ".join(each.rstrip(".") for each in wrong) + ".")
-    print(f"{path} is as it was written: {count} HDF5 file{'s' if count != 1 else ''} read to the end")
+    print(f"{path} is as it was written: {number_of(count, 'HDF5 file')} read to the end")
 
 
 def info(path: Positional[Path], picture: Output | None = None, reading: Reading = Reading()) -> None:

@@ -30,7 +30,7 @@ from ..version import __version__
 from .help import ALL, CONFIG, HELP, acts_of, overview, page, parser_of
 from .places import with_checked_arguments
 from .progress import end_as_on_interrupt, logged, say_notes
-from .sentence import INTERRUPTED, give_up, say
+from .sentence import INTERRUPTED, give_up, say, say_that_libraries_load
 
 LONGEST = 200
 """Characters of another program's message, at most."""
@@ -72,6 +72,10 @@ GROUPS: dict[str, dict[str, str]] = {
     "Benchmark and installation": {"demo": "commands", "doctor": "data", "backends": "commands"},
 }
 """Heading of the overview → its commands, each with its module; what other packages add stands first."""
+
+
+LATE = ("imaging", "track", "series", "forecast", "learn")
+"""Modules whose options cannot be had without libraries that take seconds to load."""
 
 
 @cache
@@ -192,6 +196,8 @@ def _said(error: BaseException) -> str:
 def command(name: str) -> Callable[..., None]:
     """The function of the command `name`, a key of `COMMANDS`, whose numbers are checked; imports its module."""
     module = COMMANDS[name][0]
+    if module in LATE:
+        say_that_libraries_load()
     found = import_module(f".{module}", __package__) if name in COMMANDS.own else import_module(module)
     return with_checked_arguments(getattr(found, name))
 

@@ -25,6 +25,7 @@ from ..mesh import TriangleMesh
 from ..planning.acts import of_export
 from ..representations import GaussianCloud, InMotion, MovingSurfaces, SurfaceMesh
 from ..scan import PIXEL_RANGE_M, Exposures
+from ..units import number_of
 from ..workflows.export import export
 from ..workflows.reconstruct import load_reconstruction
 from ..workflows.reconstruction import Reconstruction, chosen_frames, instants_of, reconstruction_at, where_found
@@ -81,7 +82,7 @@ def write_files(
         _export_compact(folder, compact, step_px, together)
     if bodies is not None and moving is not None and isinstance(moving.object, MovingSurfaces):
         write_moving_glb(bodies, moving.object, instants_of(folder), moving.contents)
-        say(f"wrote {bodies}: {moving.object.count} bodies in motion")
+        say(f"wrote {bodies}: {number_of(moving.object.count, 'body')} in motion")
     steps: dict[Path, list[tuple[float, Path]]] = {path: [] for path in timed}
     grid, contents = None, REFRACTION
     for one in moments_of(folder, time_frame) if timed else ():
@@ -144,7 +145,7 @@ def _export_series(path: Path, steps: Sequence[tuple[float, Path]], grid: Grid |
     else:
         assert grid is not None
         write_xdmf(out, grid, steps, of)
-    say(f"wrote {out}: {len(steps)} times, for ParaView")
+    say(f"wrote {out}: {number_of(len(steps), 'time')}, for ParaView")
 
 
 def _export_compact(folder: RunFolder, out: Path, step_px: float, together: tuple[Path, ...]) -> None:
@@ -180,7 +181,7 @@ def _export_bodies(one: Moment, out: Path) -> None:
         write_vtu(out, one.bodies, matter, of)
     else:
         write_bodies(out, one.bodies, [of.of_matter(each) for each in matter], {})
-    say(f"wrote {out}: {len(one.bodies)} bodies")
+    say(f"wrote {out}: {number_of(len(one.bodies), 'body')}")
 
 
 def _exposures_of(folder: RunFolder, volume: Path, frame: int | None) -> Exposures | None:

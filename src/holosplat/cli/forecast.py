@@ -20,7 +20,6 @@ from ..motion.forecast import FORECASTERS, SAME_TIME, Forecaster, PathForecast
 from ..motion.learned import GraphForecast
 from ..planning.acts import of_forecast
 from ..ranges import Many, Positive, Seconds, Seed, Signed, Small, checked_dataclass
-from ..report.run import report_run
 from ..scan import Scan
 from ..specimens.flow.suspension import PLASMA_VISCOSITY
 from ..workflows.evaluate import evaluate
@@ -42,6 +41,7 @@ from ..workflows.run_folder import RunFolder, claimed
 from ..workflows.track import COLLECTION, TRACKS
 from .places import Output
 from .progress import ProgressBar
+from .scans import report_run
 from .sentence import interruptible, put, say, tell
 
 FLOWING: tuple[Way, ...] = ("steady", "inertia")

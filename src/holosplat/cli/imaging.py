@@ -20,7 +20,7 @@ from ..optics.resampling import Flip
 from ..planning.acts import of_growth
 from ..planning.needs import Needs
 from ..specimens.membrane.rest import nodes_of
-from ..units import in_percent, span
+from ..units import in_percent, number_of, span
 from ..workflows.correct import FAR, Corrected, CorrectionOptions
 from ..workflows.correct import correct as correct_file
 from ..workflows.join import join as join_files
@@ -51,8 +51,9 @@ def record(
     with ProgressBar() as bar:
         done = record_file(scan, out, what, camera, light, truth, on_progress=bar.of("recording frames"), part=part)
     say(
-        f"wrote {out}: {done.projections} projections, {done.flats} flats and {done.darks} darks, {camera.bits} bits, "
-        f"{done.gain:.4g} counts a photon, {done.defects} defective pixels"
+        f"wrote {out}: {number_of(done.projections, 'projection')}, {number_of(done.flats, 'flat')} and "
+        f"{number_of(done.darks, 'dark')}, {camera.bits} bits, {done.gain:.4g} counts a photon, "
+        f"{number_of(done.defects, 'defective pixel')}"
     )
     if done.saturated > 0:
         say(f"warning: {done.saturated:.2%} of the projections' good pixels are saturated; lower --gain or the photons")
@@ -69,8 +70,9 @@ def correct(raw: Positional[Path], out: Output, how: CorrectionOptions, reading:
     """
     with ProgressBar() as bar:
         done = correct_file(raw, out, how, bar.of("correcting frames"), reading)
-    flat = f"flat fields of {done.components} components" if done.method == "dynamic" else "the mean flat field"
-    say(f"wrote {out}: {done.frames} frames by {flat}, normalised: {done.normalised}")
+    fields = f"flat fields of {number_of(done.components, 'component')}"
+    flat = fields if done.method == "dynamic" else "the mean flat field"
+    say(f"wrote {out}: {number_of(done.frames, 'frame')} by {flat}, normalised: {done.normalised}")
     say(_levels(done, how.normalise is not None or bool(how.air)))
     if how.method is None and done.method == "plain":
         say(f"method plain, for the dynamic one needs three flats, and the file has {done.flats}")
@@ -122,7 +124,8 @@ def join(
     with ProgressBar() as bar:
         joined = join_files(scans, out, pixel_size, flip, bar.of("joining frames"), part, exposures)
     rows, columns = joined.views.shape
-    say(f"wrote {out}: {len(joined)} frames of {rows} × {columns} pixels of {span(1e6 * joined.views.pixel_sizes)} µm")
+    frames, pixel = number_of(len(joined), "frame"), span(1e6 * joined.views.pixel_sizes)
+    say(f"wrote {out}: {frames} of {rows} × {columns} pixels of {pixel} µm")
 
 
 def grow(out: Output, what: Growth, resume: bool = False) -> None:
@@ -139,8 +142,8 @@ def grow(out: Output, what: Growth, resume: bool = False) -> None:
         grown = grow_cells(what, out, resume, bar.of("cells in flow"))
     wrote = out if what.compact else SeriesFolder(out).collection
     say(
-        f"wrote {wrote}: {grown.snapshots} snapshots of {what.cells} cells, "
-        f"{what.period:.4g} s apart; {grown.state.taken} steps, {grown.state.refused} refused; "
+        f"wrote {wrote}: {number_of(grown.snapshots, 'snapshot')} of {number_of(what.cells, 'cell')}, "
+        f"{what.period:.4g} s apart; {number_of(grown.state.taken, 'step')}, {grown.state.refused} refused; "
         f"volume within {in_percent(grown.volume)}, area within {in_percent(grown.area)}"
     )
 

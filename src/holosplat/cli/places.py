@@ -26,6 +26,7 @@ from ..io.lock import LOCK, require_unwritten
 from ..io.provenance import NAME, Command, beside, carried_out, records
 from ..ranges import flag, hints_of, with_checked_numbers
 from ..workflows.provenance import MANIFEST
+from .sentence import say_that_libraries_load
 
 WRITTEN = "written"
 Output = Annotated[Path, WRITTEN]
@@ -105,6 +106,8 @@ def with_checked_arguments(function: Callable[Given, Returned]) -> Callable[...,
             _require_free(out, places, force, resume)
         read = [(one.flag, one.path) for one in places if not one.written and one.is_there()]
         command = Command(sys.argv[1:], read, [out.path for out in outputs], force, bool(resume))
+        if writes and all(one.written or one.is_there() for one in places):
+            say_that_libraries_load()
         with carried_out(command), _set_aside(command.outputs if force else []):
             return function(*args, **kwargs)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ..checks import as_written, require
 from ..io.atomic import read_json, require_writable
@@ -14,22 +15,31 @@ from ..io.reading import Part, Reading, at_time
 from ..methods.continued import Continued
 from ..methods.presets import method_of
 from ..methods.solve import Settled
-from ..report.compare import Side, side_of
-from ..report.run import report_run
 from ..scan import Scan
 from ..series.collect import collect
 from ..series.folder import SeriesFolder
 from ..series.plan import prior_of
 from ..tables import from_table
-from ..workflows.evaluate import TIMES, evaluate, render, require_overlap, require_same_field, write_times
+from ..units import number_of
+from ..volume import Volume
+from ..workflows.evaluate import TIMES, Evaluation, evaluate, render, require_overlap, require_same_field, write_times
 from ..workflows.preconditions import require_one_time
 from ..workflows.provenance import scan_hash
 from ..workflows.reconstruct import load_reconstruction
 from ..workflows.reconstruction import Reconstruction, instants_of, reconstruction_at, where_found
 from ..workflows.rehearsal import rehearse
 from ..workflows.run_folder import RunFolder, claimed
+from ..workflows.verdict import Verdict
 from .progress import ProgressBar
-from .sentence import put, say, tell_result
+from .sentence import interruptible, put, say, tell_result
+
+if TYPE_CHECKING:
+    from ..report.compare import Side
+
+
+KEPT = "interrupted; the rehearsals that are done are kept, and the same command goes on"
+TRUTH = "truth"
+"""The file of source.json by which a run was evaluated, for pages that are written again."""
 
 
 def scan_for(folder: RunFolder, scan: Path | None, reading: Reading) -> Scan:
@@ -71,6 +81,16 @@ def runs_of(path: Path) -> list[tuple[float, RunFolder]]:
     return [(moment.time, RunFolder(series.run(task, moment.number))) for task, moment in each]
 
 
+def report_run(
+    folder: RunFolder, result: Reconstruction, shown: Scan, found: Evaluation, truth: Volume | None, remark: str = ""
+) -> Path:
+    """Write the report of a run, which takes seconds, and first load what draws it."""
+    say("report …")
+    from ..report.run import report_run as write
+
+    return write(folder, result, shown, found, truth, remark)
+
+
 def report_of_middle(folder: RunFolder, result: Reconstruction, measured: Scan) -> Path:
     """The report of a run of several times at the one in the middle."""
     times = measured.train().instants.tolist()
@@ -81,8 +101,11 @@ def report_of_middle(folder: RunFolder, result: Reconstruction, measured: Scan) 
     return report_run(folder, now, shown, evaluate(now, shown, None), None, whole)
 
 
-def scored(folder: RunFolder, result: Reconstruction, measured: Scan, scan: Path, reading: Reading) -> Path:
-    """Print the scores of a run on its frames, and write its report; the folder then knows where its frames are."""
+def scored(
+    folder: RunFolder, result: Reconstruction, measured: Scan, scan: Path, reading: Reading
+) -> tuple[Path, Verdict | None]:
+    """Print the scores of a run on its frames, and write its report; the folder then knows where its frames are. The
+    report, and the verdict on held-out frames."""
     found = reading.told.found({each.name: each.value for each in result.constants})
     folder.write_source(run_source(scan, replace(reading, told=found)))
     placed = result.placed(measured)
@@ -93,8 +116,8 @@ def scored(folder: RunFolder, result: Reconstruction, measured: Scan, scan: Path
         each = result.placed(read_frames(scan, every)).in_memory()
         write_times(folder.path / TIMES, result, each, evaluation.light)
     if instants_of(folder):
-        return report_of_middle(folder, result, placed)
-    return report_run(folder, result, placed, evaluation, None)
+        return report_of_middle(folder, result, placed), evaluation.verdict
+    return report_run(folder, result, placed, evaluation, None), evaluation.verdict
 
 
 def tell_found(folder: RunFolder, result: Reconstruction, report: Path) -> None:
@@ -107,7 +130,9 @@ def tell_found(folder: RunFolder, result: Reconstruction, report: Path) -> None:
     tell_result(folder, result, report)
     if result.total:
         print(result.total.words)
-    say(f"not rehearsed: for intervals of these numbers, and a verdict beside them: holosplat rehearse {folder.path}")
+    if not instants_of(folder):
+        act = f"holosplat rehearse {folder.path}"
+        say(f"not rehearsed: for intervals of these numbers, and a verdict beside them: {act}")
 
 
 def predict(run: Path, scan: Path, out: Path, split: str, reading: Reading) -> None:
@@ -118,17 +143,29 @@ def predict(run: Path, scan: Path, out: Path, split: str, reading: Reading) -> N
     require(len(chosen) > 0, f"{scan} has no {split} frames to render; choose another --split.")
     frames = render(result, chosen.exposures)
     write_scan(out, Scan(frames, chosen.exposures, chosen.is_test, {"rendered_from": run.name}))
-    say(f"wrote {out}: {len(frames)} predicted frames")
+    say(f"wrote {out}: {number_of(len(frames), 'predicted frame')}")
+
+
+def _known_truth(folder: RunFolder, result: Reconstruction) -> Volume | None:
+    """The truth that the run was evaluated by, if it is there."""
+    told = read_json(folder.source).get(TRUTH) if folder.source.is_file() else None
+    return read_volume_file(Path(told), result.delta_told) if isinstance(told, str) and Path(told).is_file() else None
 
 
 def judge(run: Path, scan: Path | None, truth: Path | None, as_json: bool, reading: Reading) -> None:
     """Print the scores of a run, by a truth, too, and renew its report by that."""
     folder = RunFolder(run)
     result, measured = run_and_scan(folder, scan, reading)
+    predicted = scan is None and folder.path.resolve() in folder.source_scan().resolve().parents
+    require(
+        not predicted or truth is not None,
+        f"{run} is a forecast of times without frames, so that only its own predictions could score it; name frames by "
+        "--scan, or a --truth.",
+    )
     true_volume = read_volume_file(truth, result.delta_told) if truth else None
     if truth is not None and true_volume is not None:
         require_same_field(true_volume.grid, measured.views, truth)
-    evaluation = evaluate(result, measured, true_volume)
+    evaluation = evaluate(result, None if predicted else measured, true_volume)
     if truth is not None and evaluation.volume is not None:
         require_overlap(evaluation.volume, truth)
     if as_json:
@@ -141,11 +178,15 @@ def judge(run: Path, scan: Path | None, truth: Path | None, as_json: bool, readi
         say("this is not the scan that was reconstructed, its frames may have been fitted; report unchanged")
     elif true_volume is not None or not folder.report.exists():
         with claimed(folder):
+            if truth is not None and folder.source.is_file():
+                folder.write_source({**read_json(folder.source), TRUTH: str(truth.resolve())})
             say(f"report: {report_run(folder, result, measured, evaluation, true_volume)}")
 
 
 def side_of_run(path: Path) -> Side:
     """A run with its scores, as far as its scan is still there."""
+    from ..report.compare import side_of
+
     folder, scan = RunFolder(path), None
     folder.require_run()
     told = read_json(folder.source).get("scan") if folder.source.is_file() else None
@@ -169,6 +210,8 @@ def rehearse_each(run: Path, times: int, bins: int | None, reading: Reading) -> 
 
 
 def _rehearse(folder: RunFolder, times: int, bins: int | None, reading: Reading) -> None:
+    several = f"rehearse takes a run of matter at one time, but {folder.path} is of several; name a run of one time."
+    require(not instants_of(folder), several)
     result, measured = run_and_scan(folder, None, reading)
     config = folder.read_config()
     with as_written(folder.config, "what reconstruct wrote"):
@@ -177,9 +220,10 @@ def _rehearse(folder: RunFolder, times: int, bins: int | None, reading: Reading)
         method = Settled.again(method, config["decided"]).method
         prior, seed = prior_of(config["prior"]), int(config["seed"])
     with claimed(folder):
-        with ProgressBar() as bar:
+        with interruptible(lambda: KEPT), ProgressBar() as bar:
             how = {"times": times, "bins": bins, "seed": seed, "folder": folder, "on_progress": bar.show}
             found = rehearse(result, measured, prior, method, **how)
-        page = report_run(folder, result, measured, evaluate(result, measured, None), None)
+        truth = _known_truth(folder, result)
+        page = report_run(folder, result, measured, evaluate(result, measured, truth), truth)
     put(found.lines())
     say(f"report: {page}")

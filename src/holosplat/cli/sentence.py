@@ -31,6 +31,16 @@ def say(text: str) -> None:
     print(text, file=sys.stderr)
 
 
+def say_that_libraries_load() -> None:
+    """Say it where that takes seconds, and once."""
+    if "torch" not in sys.modules and not _loading:
+        _loading.append(True)
+        say("loading libraries …")
+
+
+_loading = list[bool]()
+
+
 @contextmanager
 def interruptible(sentence: Callable[[], str]) -> Iterator[None]:
     """In the block, Ctrl-C says a `sentence`, and ends with `INTERRUPTED`."""
@@ -39,6 +49,12 @@ def interruptible(sentence: Callable[[], str]) -> Iterator[None]:
     except KeyboardInterrupt:
         say(sentence())
         raise SystemExit(INTERRUPTED) from None
+
+
+def cut_off(folder: RunFolder) -> str:
+    """How a run goes on that was interrupted before its end."""
+    begun = folder.config.is_file()
+    return f"interrupted; {f'go on with --resume {folder.path}' if begun else 'nothing was kept yet, so begin anew'}"
 
 
 def give_up(sentence: str) -> NoReturn:

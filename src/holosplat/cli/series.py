@@ -25,6 +25,7 @@ from ..series.stream import RECEIVED, SCHEME, Stream, Streaming
 from ..series.task import run_task
 from ..series.watch import Watch, WatchFolder, Watching
 from ..tables import to_table
+from ..units import number_of
 from ..workflows.verdict import some
 from .light import RunLightFlags
 from .options import MethodOptions, PriorOptions
@@ -87,7 +88,7 @@ class SlurmFlags(Slurm):
     def carry_out(self, folder: SeriesFolder, retry: bool) -> None:
         """Write the script, and submit it if that is asked for."""
         count, numbers = write_script(folder, self, retry)
-        say(f"wrote {folder.script} for {count} task(s): {numbers}")
+        say(f"wrote {folder.script} for {number_of(count, 'task')}: {numbers}")
         if self.submit:
             print(submit(folder))
             return
@@ -120,7 +121,8 @@ def plan(
     found = plan_series(listed(scans), settings, matter.prior, reading, windows)
     folder.create(found)
     tasks, times = len(found.windows()), len(found.moments())
-    say(f"{out}: {times} times of {len(found.sources)} scan(s) in {tasks} task(s); now: holosplat series run {out}")
+    said = f"{number_of(times, 'time')} of {number_of(len(found.sources), 'scan')} in {number_of(tasks, 'task')}"
+    say(f"{out}: {said}; now: holosplat series run {out}")
 
 
 def run(
@@ -245,7 +247,7 @@ def reconstruct_each(
     if needs is not None:
         count = times_of(seen)
         others = ((how, one.times(count)) for how, one in smaller(one_time(seen), method, matter))
-        tell(f"{count} times", needs, out, others)
+        tell("the series", needs, out, others)
     folder = SeriesFolder(out)
     if resume and out.exists():
         require(
@@ -309,4 +311,4 @@ def watch(
     with interruptible(lambda: f"ended; what {out} holds is whole, and the same command goes on from there"):
         watch = Watch(source, result, settings, matter.prior, reading, how, say, stream=feed)
         count = watch.run(said)
-    say(f"ended after {count} scan(s)")
+    say(f"ended after {number_of(count, 'scan')}")

@@ -18,6 +18,7 @@ from ..geometry import Grid, Views
 from ..io.atomic import require_writable
 from ..ranges import checked_dataclass
 from ..scan import Exposures
+from ..units import number_of
 from .options import (
     BeamlineOptions,
     MaterialOptions,
@@ -201,8 +202,9 @@ def simulate(
     if truth.write_mesh(specimen.matter):
         say(f"wrote {truth.truth_mesh}: the true surfaces")
     _write_frames(targets, is_test, source.frames(specimen.matter, filled, true, how))
-    text = "{} frames of {} × {} pixels, {} of them held out".format(len(true), *beamline.detector, is_test.sum())
-    say(f"wrote {out}: {text}{f', at {len(times)} times from {len(views)} views' if motion.frame_rate else ''}")
+    text = f"{number_of(len(true), 'frame')} of {' × '.join(map(str, beamline.detector))} pixels"
+    moving = f", at {number_of(len(times), 'time')} from {number_of(len(views), 'view')}" if motion.frame_rate else ""
+    say(f"wrote {out}: {text}, {is_test.sum()} of them held out{moving}")
     if truth.true_exposures:
         say(f"wrote {truth.true_exposures}: the same frames, with the exposures as they were")
     for path, frame in volumes:

@@ -28,10 +28,10 @@ from ..motion.track import TrackOptions
 from ..optics.background import LightOptions
 from ..planning.acts import of_motion, of_surfaces, of_track
 from ..ranges import Metres, Seed, Share, Weight, checked_dataclass
-from ..report.run import report_run
 from ..representations import MovingSurfaces
 from ..scan import Scan
 from ..tables import with_entries
+from ..units import number_of
 from ..workflows.evaluate import TIMES, Evaluation, score_object, write_times
 from ..workflows.evaluate import evaluate as score
 from ..workflows.forecast import read_forecast
@@ -46,8 +46,8 @@ from .light import LightFlags
 from .options import PriorOptions
 from .places import Output
 from .progress import ProgressBar
-from .scans import report_of_middle, run_and_scan
-from .sentence import interruptible, put, say, tell_frames, tell_result
+from .scans import report_of_middle, report_run, run_and_scan
+from .sentence import cut_off, interruptible, put, say, tell_frames, tell_result
 
 
 @checked_dataclass
@@ -154,7 +154,7 @@ def track(
             "--body FILE helps."
         )
     prior = matter.prior(measured.exposures.reference_energy, reading.told.wall)
-    with interruptible(lambda: _cut_off(folder)), ProgressBar() as bar:
+    with interruptible(lambda: cut_off(folder)), ProgressBar() as bar:
         told = {"light": illumination.options(), "folder": folder, "resume": resume, "on_progress": bar.show}
         told |= {"after": before}
         result = follow(measured, prior, options, seed, **told)
@@ -172,10 +172,6 @@ def _scored(folder: RunFolder, result: Reconstruction, measured: Scan, scan: Pat
     evaluation = score(result, measured, None)
     write_times(folder.path / TIMES, result, measured, evaluation.light)
     return evaluation
-
-
-def _cut_off(folder: RunFolder) -> str:
-    return f"interrupted{f'; go on with --out {folder.path} --resume' if folder.checkpoint.is_file() else ''}"
 
 
 FEWEST_TIMES = 3
@@ -214,7 +210,7 @@ def reconstruct_in_motion(
         return _still(f"motion is asked of frames of {FEWEST_TIMES} times or more, but there are {count}")
     tell_frames("matter in motion", train, folder.path, lambda seen: of_motion(seen, options))
     measured = planned.in_memory()
-    with interruptible(lambda: _cut_off(folder)), ProgressBar() as bar:
+    with interruptible(lambda: cut_off(folder)), ProgressBar() as bar:
         told = {"light": light, "folder": folder, "resume": resume, "on_progress": bar.show}
         found = reconstruct_moving(measured, prior, options, seed, **told)
     if found is None:
@@ -284,7 +280,7 @@ def surface(
     write_bodies(out, bodies, [constants] * len(bodies), said)
     for of, scores in ((name, before), ("surfaces", after)):
         print(f"{of}:", *scores.lines(), sep="\n  ")
-    say(f"wrote {out}: {len(bodies)} bodies of {len(found.faces)} triangles, {seconds:.1f} s")
+    say(f"wrote {out}: {number_of(len(bodies), 'body')} of {len(found.faces)} triangles, {seconds:.1f} s")
 
 
 def write_bodies(

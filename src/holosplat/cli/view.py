@@ -17,6 +17,7 @@ from ..io.reading import Reading, Told
 from ..progress import FitProgress, FitState
 from ..ranges import Many, Within, checked_dataclass
 from .places import Output
+from .sentence import say_that_libraries_load
 
 if TYPE_CHECKING:
     from ..show.server import LiveView
@@ -168,6 +169,7 @@ def rehearse(run: Positional[Path], times: Many = 8, bins: Many | None = None, r
         times: Rehearsals, 2 or more.
         bins: Pixels joined along an edge, for speed (default: to about 48 pixels along the shorter side).
     """
+    say_that_libraries_load()
     from .scans import rehearse_each
 
     rehearse_each(run, times, bins, reading)

@@ -312,9 +312,9 @@ def tell_views(scan: Scan) -> None:
             "unit, or in the first line of the file of --angles"
         )
     elif len(twice := _repeated(angles)) and len(twice) < len(views) // 2:
-        shown = ", ".join(f"{angle:.6g}°" for angle in twice[:FEW])
+        shown = ", ".join(dict.fromkeys(f"{angle:.6g}°" for angle in twice[:FEW]))
         warn(
-            f"{len(twice)} frames have the angle of another one ({shown}); if one of them is wrong, correct it, or "
+            f"more than one frame has the angle {shown}; if one of them is wrong, correct it, or "
             "leave such frames out by --leave-out"
         )
 

@@ -20,6 +20,7 @@ import numpy as np
 
 from ..checks import InputError, finite, note, require, require_regular
 from ..scan import Scan
+from ..units import number_of
 from .angles import angles_of, in_order, read_angles, tell_angles
 from .atomic import atomic_folder, write_json
 from .lock import is_hidden
@@ -196,7 +197,7 @@ def _tell_order(found: ScanFile) -> None:
         f"{which} {first.name(n)} at {round(angles[n], 6) + 0.0:.6g}°" for which, n in (("first", 0), ("last", -1))
     )
     counts = [f", {count} {name}" for kind, name in KINDS.items() if (count := len(found.numbers(kind)))]
-    note(f"{found.path}: {len(angles)} projections ({ends}){''.join(counts)}")
+    note(f"{found.path}: {number_of(len(angles), 'projection')} ({ends}){''.join(counts)}")
 
 
 def _recognises(path: Path) -> bool:

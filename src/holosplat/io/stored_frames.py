@@ -113,7 +113,7 @@ def require_filled(dataset: h5py.Dataset, label: str, wanted: np.ndarray) -> np.
     )
     if not gaps.any():
         return None
-    note(f"{label}: {int(gaps.sum())} pixels that no source fills count as defective")
+    note(f"{label}: pixels that no source fills ({int(gaps.sum())}) count as defective")
     return gaps
 
 
@@ -235,7 +235,7 @@ class StoredFrames(Derived):
         )
         dark, light = file.mean(DARK), None
         if mask.any():
-            note(f"{file.label}: the {int(mask.sum())} pixels that the file marks as defective {FILLED}")
+            note(f"{file.label}: pixels that the file marks as defective ({int(mask.sum())}) {FILLED}")
         if has_flats:
             light, mask = lit(file.label, file.mean(FLAT) - dark, mask)
         stacks, places = list[Any](), list[Path]()

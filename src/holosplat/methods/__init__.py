@@ -9,7 +9,7 @@ from .gaussians import Gaussians, gaussian_fit
 from .ground import ExtraTerm
 from .method import Method, Near, Stage, Task, begun, finished
 from .per_view import PerView
-from .solve import Settled, settled, solve
+from .solve import Settled, require_possible, settled, solve
 from .surface_fit import Extraction, SurfaceFit, SurfaceOptions
 from .surfaces import Surfaces, refine_surfaces
 from .uncertain import Determined, Uncertain
@@ -62,6 +62,7 @@ __all__ = [
     "finished",
     "gaussian_fit",
     "refine_surfaces",
+    "require_possible",
     "settled",
     "solve",
 ]

@@ -153,7 +153,7 @@ def prepared(task: Task, method: Method | None = None, before: Prepared | None =
             task = replace(task, decisions=(*task.decisions, *ratio))
         task.on_progress(STAGE, 0.0)
         first.taken, made = decided(first, options, told, open_to)
-        if _may_have_both_sides(task, method) and (spherical or first.folds.by != BY_FISSION):
+        if _may_have_both_sides(task, method, bool(signs)) and (spherical or first.folds.by != BY_FISSION):
             first, sides = decide_sides(first, options, told, spherical)
             task = replace(task, prior=with_sign(task.prior, (sides,)), decisions=(*task.decisions, sides))
             if task.prior.two_sided:
@@ -190,10 +190,10 @@ def _open_to(task: Task, method: Method | None) -> Hypothesis:
     return tuple(one for one, free in asked.items() if free)
 
 
-def _may_have_both_sides(task: Task, method: Method | None) -> bool:
-    """Whether matter may be on both sides of its medium: a known material is on one. Where a method goes on from a run,
-    that has decided."""
-    told = bool(task.prior.materials) or task.prior.two_sided
+def _may_have_both_sides(task: Task, method: Method | None, decided: bool) -> bool:
+    """Whether matter may be on both sides of its medium: a known material is on one, and matter whose sign is told, and
+    not decided by frames. Where a method goes on from a run, that has decided."""
+    told = bool(task.prior.materials) or task.prior.two_sided or (task.prior.sign != 0 and not decided)
     can = method is not None and method.two_sided and not (task.scan.is_series or isinstance(method, Continued))
     return can and not told
 

@@ -49,10 +49,6 @@ def decide_matter(task: Task, methods: Mapping[MatterKind, Method] | None = None
     fitted: briefly at first, for bodies need more steps than a smooth volume, so that short fits which speak for levels
     are enough. One ratio δ/β holds one level. Of views that are too few to set some aside, levels are taken.
     """
-    if len(task.prior.materials) > 1:
-        return Decision(NAME, SEVERAL, "several materials are known")
-    if task.prior.two_sided:
-        return Decision(NAME, CONTINUOUS, "matter lies on both sides of its medium")
     task.on_progress(STAGE, 0.0)
     first = first_of_task(task)
     if first.folds.by == BY_FISSION:

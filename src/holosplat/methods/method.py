@@ -192,6 +192,7 @@ class Stage(Protocol):
 class Method(Protocol):
     """Options of a method, as a frozen dataclass; `kind` is its name in tables, files and on the command line.
 
+    kinds_of_matter: those that it can reconstruct, of one material on one side of its medium
     of_series: whether it takes all times of a scan at once; all others take frames of one time
     mixes_kinds: whether states of different kinds of Objects compete for its result
     any_backend: whether GPUs can compute it, too
@@ -202,6 +203,7 @@ class Method(Protocol):
     """
 
     kind: ClassVar[str]
+    kinds_of_matter: ClassVar[tuple[MatterKind, ...]] = ("levels", "continuous")
     of_series: ClassVar[bool] = False
     mixes_kinds: ClassVar[bool] = False
     any_backend: ClassVar[bool] = False

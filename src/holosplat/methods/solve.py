@@ -9,14 +9,14 @@ from typing import Any
 from ..backends import resolve
 from ..checks import require
 from ..inference import Decision
-from ..matter import KnownSeveral, MatterKind
+from ..matter import MaterialPrior, MatterKind
 from ..representations import Stored
 from ..scan import Scan
 from ..tables import to_table
 from .auto import Auto
 from .gaussians import Gaussians
 from .illumination import prepared
-from .levels import LEVELS, NAME, decide_matter, kind_of, ratio_of_one
+from .levels import LEVELS, NAME, SEVERAL, decide_matter, kind_of, ratio_of_one
 from .method import Method, Task, first_of_task, solve_stages
 from .trials import unseen_kinds
 from .uncertain import Determined, Uncertain, determine, placed, told
@@ -69,18 +69,17 @@ def settled(
     """The method to run for `task`, the kind of its matter (`matter`, or what the frames say), and what is `uncertain`.
 
     Where nothing is known, δ/β of continuous matter is uncertain, too; for `Auto` that of one level. Errors:
-    `InputError` for continuous matter of several materials, and those of `determine`.
+    those of `determine`.
     """
-    require(
-        not (matter == "continuous" and isinstance(task.prior, KnownSeveral)),
-        "--matter must be levels or auto where several materials are known, but it is continuous; give one --material.",
-    )
+    kinds, why = _possible(method, task.prior)
     if isinstance(method, Gaussians):
         resolve(method.fit.backend)  # before the decision, which takes its time
     constants = determine(task, uncertain or Uncertain())
     task = told(task, constants)
     if matter:
         decision = Decision(NAME, matter, "told")
+    elif len(kinds) == 1:
+        decision = Decision(NAME, SEVERAL if len(task.prior.materials) > 1 else kinds[0], why)
     elif method.wants_levels:
         decision = decide_matter(task, _kinds(method, task))
     else:
@@ -95,6 +94,22 @@ def settled(
     return Settled(method, kind, decision, constants)
 
 
+def _possible(method: Method, prior: MaterialPrior) -> tuple[tuple[MatterKind, ...], str]:
+    """The kinds of matter that there can be, and why there are no others."""
+    if len(prior.materials) > 1:
+        return ("levels",), "several materials are known"
+    if prior.two_sided:
+        return ("continuous",), "matter lies on both sides of its medium"
+    return method.kinds_of_matter, f"the method {method.kind} has no levels"
+
+
+def require_possible(method: Method, prior: MaterialPrior, matter: MatterKind | None) -> None:
+    """`InputError` for a kind of matter that the method, or the prior, cannot have."""
+    kinds, why = _possible(method, prior)
+    possible = matter is None or matter in kinds
+    require(possible, f"--matter must be {kinds[0]} or auto, because {why}, but it is {matter}; leave it.")
+
+
 def _kinds(method: Method, task: Task) -> Mapping[MatterKind, Method] | None:
     """The methods whose fits say of which kind matter is, where first volumes do not: of a known material always, for
     these alone would call cells in few views continuous; else those of `Auto`."""
@@ -104,7 +119,9 @@ def _kinds(method: Method, task: Task) -> Mapping[MatterKind, Method] | None:
 
 
 def solve(method: Method, task: Task, matter: MatterKind | None = None) -> Stored:
-    """What `method` makes of `task` in memory, without a folder; Ctrl-C is passed on. matter: as for `settled`."""
+    """What `method` makes of `task` in memory, without a folder; Ctrl-C is passed on. matter: as for `settled`. Errors:
+    those of `require_possible`."""
+    require_possible(method, task.prior, matter)
     task = prepared(task, method)
     found = settled(method, task, matter)
     task = found.task(task)

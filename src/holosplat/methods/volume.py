@@ -16,7 +16,7 @@ from ..checks import at_least, require
 from ..fit.smooth_volume import ContinuousPrior
 from ..frames import evenly
 from ..geometry import Grid
-from ..matter import DeltaBeta, KnownRatio, Matter
+from ..matter import DeltaBeta, KnownRatio, Matter, MatterKind
 from ..optics.retrieval.spectra import contrast_level
 from ..ranges import Signed, Weight, checked_dataclass
 from ..representations import Stored, VoxelGrid
@@ -47,6 +47,7 @@ class SmoothVolume(Method):
     """
 
     kind: ClassVar[str] = "volume"
+    kinds_of_matter: ClassVar[tuple[MatterKind, ...]] = ("continuous",)
     cones: ClassVar[bool] = True
     likelier: ClassVar[bool] = True
     two_sided: ClassVar[bool] = True

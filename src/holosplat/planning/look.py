@@ -23,8 +23,6 @@ ABOVE = 2.0
 """Times the noise's power from which on frames show structure."""
 NOISELESS = 0.02
 """Noise, as a share of the contrast, below which frames count as free of noise, as in the verdict on a run."""
-RELATIVE = (0.2, 5.0)
-"""Levels of frames that were divided by their flat field."""
 
 
 @dataclass(frozen=True)
@@ -62,11 +60,6 @@ class Look:
     def is_light(self) -> bool:
         """Whether the values can be intensities, which are above 0 but for noise."""
         return self.level > 0 and self.least > -self.level
-
-    @property
-    def is_relative(self) -> bool:
-        """Whether frames seem to have been divided by a flat field, by their level."""
-        return RELATIVE[0] < self.level < RELATIVE[1]
 
     def rows(self) -> dict[str, str]:
         """The same in words, by name."""

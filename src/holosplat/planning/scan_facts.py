@@ -31,9 +31,10 @@ from ..methods.gaussians import Gaussians
 from ..methods.window import windows_of
 from ..optics.noise import NoiseModel, noise_levels, noise_share
 from ..optics.sampling import fringes, on_larger_pixels
+from ..preprocess import fault_of
 from ..scan import Exposures, Scan
 from ..tables import with_entries
-from ..units import beam_named, span
+from ..units import beam_named, number_of, span
 from .acts import of_each_time
 from .look import LOOKED, Look, looked
 from .needs import (
@@ -75,7 +76,6 @@ class ScanFacts:
 def facts_of_scan(loader: Loader, path: Path, reading: Reading) -> ScanFacts:
     """Describe the scan at `path`. Errors: `InputError` for faults that stop its reading and that no option mends."""
     stand_ins, unsaid = dict[str, Any](), dict[str, str]()
-    reading.told.vouch(path)
     while True:
         try:
             given = stand_ins | reading.told.given(loader.takes)
@@ -139,10 +139,8 @@ def _facts(path: Path, reading: Reading, loader: Loader, opened: Opened, unsaid:
             f"{path} must hold intensities, which are above 0, but its level is {look.level:.4g}; of the slices of a "
             "volume, `holosplat simulate` makes frames (--voxel-size)."
         )
-    elif not look.is_relative:
-        missing.append(
-            f"{path} holds counts (level {look.level:.4g}) that nothing divides; divide them by --flats and --darks."
-        )
+    elif fault := fault_of(look.level):
+        missing.append(f"{path}: {fault}")
     words = ["holosplat reconstruct", shlex.quote(str(path)), *_options(reading)]
     words += [f"--{OPTIONS.get(name, name)} …" for name in unsaid]
     more = " ".join([*words, *["--motion each"] * scan.is_series, "--out run"])
@@ -159,18 +157,20 @@ def _options(reading: Reading) -> list[str]:
 
 def _frames(scan: Scan, file: ScanFile | None) -> dict[str, str]:
     h, w = scan.views.shape
-    counts = [f"{len(scan)} projections of {h} × {w} pixels (rows × columns)"]
+    counts = [f"{number_of(len(scan), 'projection')} of {h} × {w} pixels (rows × columns)"]
     if file is not None:
-        for kind, name in ((FLAT, "flats"), (DARK, "darks"), (INVALID, "left out")):
-            counts += [f"{len(file.numbers(kind))} {name}"] if len(file.numbers(kind)) else []
+        for kind, name in ((FLAT, "flat"), (DARK, "dark")):
+            counts += [number_of(len(file.numbers(kind)), name)] if len(file.numbers(kind)) else []
+        left = len(file.numbers(INVALID))
+        counts += [f"{left} left out"] if left else []
     held_out = int(scan.is_test.sum())
     counts += [f"{held_out} held out of the fit"] if held_out else []
     rows = {"frames": ", ".join(counts)}
     if file is not None and file.mask().any():
         rows["defective pixels"] = f"{int(file.mask().sum())}, as the file marks them"
     if scan.is_series:
-        times = scan.instants
-        rows["times"] = f"{len(times)} from {times[0]:.4g} to {times[-1]:.4g} s, {len(scan) // len(times)} frames each"
+        times, each = scan.instants, number_of(len(scan) // len(scan.instants), "frame")
+        rows["times"] = f"{len(times)} from {times[0]:.4g} to {times[-1]:.4g} s, {each} each"
     return rows
 
 
@@ -211,7 +211,8 @@ def _angles(scan: Scan, file: ScanFile | None, unsaid: Unsaid) -> dict[str, str]
         places = np.flatnonzero(steps > GAP * step)
         low = np.unique(turned.round(4))
         gaps = ", ".join(f"{low[n]:.5g}° to {low[n + 1]:.5g}°" for n in places[:MOST_GAPS])
-        rows["steps"] = f"{step:.4g}°, {f'{len(places)} gaps: {gaps}' if len(places) else 'no gaps'}"
+        named = f"{number_of(len(places), 'gap')}: {gaps}" if len(places) else "no gaps"
+        rows["steps"] = f"{step:.4g}°, {named}"
     columns = 0.5 * (scan.views.shape[1] - 1) - scan.views.shifts[:, 0] / scan.views.pixel_sizes
     rows["axis"] = f"column {span(columns)} of {scan.views.shape[1]} (--axis-column; holosplat align --axis-only)"
     return rows

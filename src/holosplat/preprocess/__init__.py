@@ -2,6 +2,7 @@
 
 from .eigen_flats import EigenFlats, TotalVariationWeights, eigen_flats, significant
 from .pixels import PixelRepair, defective_pixels, fixed_pattern, relative_intensity, unlit
+from .relative import fault_of, require_relative
 
 __all__ = [
     "EigenFlats",
@@ -9,8 +10,10 @@ __all__ = [
     "TotalVariationWeights",
     "defective_pixels",
     "eigen_flats",
+    "fault_of",
     "fixed_pattern",
     "relative_intensity",
+    "require_relative",
     "significant",
     "unlit",
 ]

@@ -149,7 +149,7 @@ def lit(label: str, light: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np
     saturated = none & np.isnan(light)
     for which, why in ((none & ~saturated, "not brighter than the darks"), (saturated, "saturated")):
         if which.any():
-            warn(f"{label}: {int(which.sum())} pixels whose flats are {why} {FILLED}")
+            warn(f"{label}: pixels whose flats are {why} ({int(which.sum())}) {FILLED}")
     return np.where(dim, 1.0, light), mask | dim
 
 
@@ -168,8 +168,8 @@ def filled(label: str, frames: np.ndarray, found: np.ndarray, mask: np.ndarray, 
             f"{numbers[worst]} are not, or saturated; correct the frames by their flats and darks, crop them, or leave "
             "this one out.",
         )
-        which = f"{int(found.sum())} pixels in {count} of {len(frames)} frames"
-        warn(f"{label}: {which} are not above 0, no numbers or saturated; they {FILLED}")
+        which = f"{int(found.sum())} in {count} of {len(frames)} frames"
+        warn(f"{label}: pixels that are not above 0, no numbers or saturated ({which}) {FILLED}")
     missing = found | mask
     if not missing.any():
         return frames, None

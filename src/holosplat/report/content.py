@@ -222,7 +222,7 @@ class ReportContent:
     - explained: the verdict on the training frames; None: not judged; scan: their name, as a command takes it
     - delta_told: whether δ is known from frames or prior; else β stands for δ in all volumes
     - total: the total δ by these frames; None: unknown
-    - rehearsal: what rehearsals of the run show; None: there were none
+    - rehearsal: what rehearsals of the run show; None: there were none; at_rest: whether there can be any
     - moving: bodies in motion, whose volumes are those of one time; None: matter stands still
     - view: the interactive 3D view; None: there is none
     - guess: that of a network before the fit; None: there was none
@@ -250,6 +250,7 @@ class ReportContent:
     delta_told: bool = True
     total: TotalMatter | None = None
     rehearsal: Rehearsal | None = None
+    at_rest: bool = True
     geometry: Geometry | None = None
     lit: LitViews | None = None
     moving: Moving | None = None

@@ -30,9 +30,9 @@ from .style import (
     WIDTH,
     Block,
     PanelGrid,
+    around_zero,
     decimal_scale,
     drawn_block,
-    from_dark,
     grey_limits,
     image_panel,
     largest,
@@ -167,9 +167,10 @@ def _projected(
     name, unit = ("phase φ", " (rad)") if phase else ("absorption 2kB", "")
     scale, power = (1.0, "") if phase else decimal_scale(max(float(np.abs(i).max()) for i in shown))
     unit = f" ({power})" if power else unit
-    pitch, limits = (pixel_size, pixel_size), value_limits([image / scale for image in shown])
+    pitch = (pixel_size, pixel_size)
+    colours, limits = around_zero(colours, value_limits([image / scale for image in shown]))
     for panel, image in zip(axes, shown):
-        drawn = image_panel(panel, image / scale, pitch, from_dark(colours, limits), limits)
+        drawn = image_panel(panel, image / scale, pitch, colours, limits)
     panels.bar(drawn, column + len(shown) - 1, (row, row), name + unit)
     scale_bar(axes[0], shown[0].shape[1] * pixel_size)
     title = name[0].upper() + name[1:]
@@ -204,8 +205,7 @@ def slices_figure(
     volumes = [(name, v.delta) for name, v in zip(names, (truth, reconstruction)) if v is not None]
     scale, power = decimal_scale(quantity.factor * max(float(np.abs(v).max()) for _, v in volumes))
     scale /= quantity.factor
-    limits = value_limits([v / scale for _, v in volumes])
-    colours = from_dark(DELTA_MAP, limits)
+    colours, limits = around_zero(DELTA_MAP, value_limits([v / scale for _, v in volumes]))
     widths, heights = plane_sizes(reconstruction.grid)
     panels = PanelGrid(1 if truth is None else 3, widths, heights, (2,))
     for row, (name, values) in enumerate(volumes):

@@ -9,9 +9,10 @@ from ..checks import InputError, as_written, require
 from ..io.atomic import atomic_path, read_json, require_writable
 from ..io.facts import Facts, facts_of_matter, no_kind
 from ..io.formats import loader_of
+from ..io.provenance import origin
 from ..io.reading import Reading
 from ..memory import uncollected
-from ..units import beam_named, in_percent
+from ..units import beam_named, in_percent, number_of
 from ..workflows.choice import Choice
 from ..workflows.run_folder import SERIES, RunFolder
 
@@ -48,6 +49,7 @@ def info(path: str | Path, reading: Reading = Reading(), picture: Path | None = 
     if picture is not None:
         require(picture.suffix.lower() == ".png", f"--picture must be a .png file, but it is {picture}; name another.")
         require_writable(picture)
+    reading.told.vouch(path)
     found = None
     try:
         if (path / SERIES).is_file():
@@ -95,7 +97,7 @@ def facts_of_series(path: Path) -> Facts:
         done = [row for _, row in sorted(rows.items()) if row["status"] == "done"]
         judged = [(row["number"], bool(row["good"]), str(row["words"])) for row in done if row["good"] is not None]
     chosen, count = begun_motion(path), sum(times for _, times in scans)
-    said = {"what": f"a series of {count} times", "made from": ", ".join(scan for scan, _ in scans)}
+    said = {"what": f"a series of {number_of(count, 'time')}", "made from": ", ".join(scan for scan, _ in scans)}
     said |= {"state": f"{len(done)} of {count} times are done"}
     said |= {"verdict": "; ".join(line.strip().rstrip(".") for line in said_of_times(judged, count))} if judged else {}
     said |= {"chosen": chosen.line} if chosen else {}
@@ -120,14 +122,16 @@ def _of_run(folder: RunFolder) -> Facts:
     scan = source or "SCAN"
     commands = []
     if not done:
-        commands.append(f"holosplat reconstruct {scan} --out {folder.path} --resume, with the options of before")
+        act = str(origin(folder.path).get("command", "")).split()[1:2]
+        again = f"holosplat reconstruct {scan} --out {folder.path} --resume, with the options of before"
+        commands.append(f"holosplat {act[0]} --resume {folder.path}" if act else again)
     if object_there:
         commands += [
             f"holosplat evaluate {folder.path} --truth VOLUME",
             f"holosplat export {folder.path} --volume v.h5",
         ]
         commands += [f"holosplat view {folder.path}"]
-        if "verdict" in summary and "rehearsal" not in summary:
+        if "verdict" in summary and "rehearsal" not in summary and "times_s" not in summary:
             commands += [f"holosplat rehearse {folder.path}"]
     missing = [] if source else [f"{folder.path} does not say which scan it is of; name it with --scan."]
     return Facts(rows, tuple(missing), tuple(commands))
@@ -150,6 +154,7 @@ def _result(summary: dict) -> dict[str, str]:
     shares = ", ".join(f"{name} {in_percent(float(share))}" for name, share in judged.items())
     rows |= {"scores": f"matter that training frames leave unexplained: {shares}"} if shares else {}
     rows |= {"total": total["words"]} if "words" in total else {}
-    stages = ", ".join(f"{name} {value:.3g} s" for name, value in seconds.items())
-    rows["time"] = f"{sum(seconds.values()):.3g} s ({stages}) on {summary.get('device', 'an unknown device')}"
+    if seconds:
+        stages = ", ".join(f"{name} {value:.3g} s" for name, value in seconds.items())
+        rows["time"] = f"{sum(seconds.values()):.3g} s ({stages}) on {summary.get('device', 'an unknown device')}"
     return rows

@@ -13,6 +13,7 @@ from ..frames import evenly
 from ..optics.sampling import fringes
 from ..planning.look import Spectrum
 from ..planning.scan_facts import OPTICS, ScanFacts
+from ..preprocess import fault_of
 from .content import LitViews, pixel_of
 from .style import (
     FAINT,
@@ -22,9 +23,9 @@ from .style import (
     SIGNED_MAP,
     WIDTH,
     PanelGrid,
+    around_zero,
     colour_bar,
     decimal_scale,
-    from_dark,
     grey_limits,
     image_panel,
     largest,
@@ -65,7 +66,7 @@ def phase_figure(
     chosen = evenly(len(measured), most)
     phase, limits = phase[chosen], grey_limits(phase[chosen], (0.02, 99.98))
     factor = np.ones_like(phase) if light is None else light[chosen]
-    third = (phase, from_dark(PHASE_MAP, limits), limits, "Phase", "phase (rad)")
+    third = (phase, *around_zero(PHASE_MAP, limits), "Phase", "phase (rad)")
     return _beside(measured[chosen], factor, third, [labels[int(n)] for n in chosen], pixel_sizes[chosen].tolist())
 
 
@@ -122,7 +123,7 @@ def look_figure(found: ScanFacts) -> Figure:
             scale_bar(axes, w * pixel)
         letter(axes, k, f"Frame {found.numbers[n]}")
     if drawn is not None:
-        name = "Relative intensity" if look.is_relative else "Counts"
+        name = "Counts" if fault_of(look.level) else "Relative intensity"
         colour_bar(figure, drawn, figure.add_subplot(grid[0, len(shown)]), name, "both")
     axes = figure.add_subplot(grid[0, len(shown) + 1])
     _spectrum(axes, look.spectrum, found, pixel)

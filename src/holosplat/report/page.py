@@ -10,7 +10,7 @@ import jinja2
 import numpy as np
 
 from ..io.atomic import atomic_path
-from ..units import XRAYS_KEV, beam_named, in_percent
+from ..units import XRAYS_KEV, beam_named, in_percent, number_of
 from ..workflows.certainty import NULL
 from ..workflows.next_step import Step, next_step
 from ..workflows.rehearsal import Rehearsal
@@ -59,10 +59,11 @@ def headline(content: ReportContent) -> Headline:
     text, details = text.rstrip("."), tuple(filter(None, (rest[:1].upper() + rest[1:],)))
     if content.rehearsal is not None and found is content.explained:
         return _rehearsed(content.rehearsal, (words, scores), content.scan)
+    unrehearsed = (NOT_REHEARSED,) * content.at_rest
     if found.good:
-        return Headline(text, True, (*details, scores, NOT_REHEARSED))
+        return Headline(text, True, (*details, scores, *unrehearsed))
     text = f"Do not trust this volume: {text[0].lower()}{text[1:]}"
-    reasons = (*(in_print(reason) for reason in found.reasons), NOT_REHEARSED)
+    reasons = (*(in_print(reason) for reason in found.reasons), *unrehearsed)
     return Headline(text, False, (*details, *reasons, scores), next_step(found.cause, content.scan))
 
 
@@ -111,7 +112,7 @@ def verdict(content: ReportContent) -> str:
 
 def _followed(moving: Moving) -> str:
     count, times = moving.bodies.count, moving.times
-    what = f"follows {count} bod{'y' if count == 1 else 'ies'} through {len(times)} times"
+    what = f"follows {number_of(count, 'body')} through {number_of(len(times), 'time')}"
     if not moving.whole.any():
         return f"{what}, none of them ever whole in the field of view"
     spread = float(np.nanmedian(moving.spread("volume_m3") / moving.mean("volume_m3")))

@@ -25,18 +25,18 @@ from ..projectors.voxels import voxel_line_integrals
 from ..representations import MovingSurfaces, Stored
 from ..scan import Scan
 from ..tables import to_table
-from ..units import beam_named, span, wavenumber
+from ..units import beam_named, number_of, span, wavenumber
 from ..volume import Volume
 from ..workflows.evaluate import TIMES, Evaluation, lines_of_times, of_absorption, render
 from ..workflows.forecast import NUMBERS, flow_in_words, read_band
 from ..workflows.motion_choice import begun_motion
-from ..workflows.reconstruct import Reconstruction
+from ..workflows.reconstruction import Reconstruction, instants_of
 from ..workflows.rehearsal import read_rehearsal
 from ..workflows.run_folder import RunFolder
 from ..workflows.track import read_errors
 from .content import GuessShown, HeldOutViews, LitViews, Moving, ProjectedMaps, ReportContent, view_labels
 from .page import write_report
-from .style import ENDS, data_uri, new_figure, styled
+from .style import DELTA_MAP, ENDS, around_zero, data_uri, new_figure, styled
 from .surface import ForecastShown
 from .view3d.view import SLICE_BYTES, VOLUME_BYTES, View3D, part_of, raster_of, volume_part
 
@@ -84,7 +84,8 @@ def report_run(
     material = found.matter.single and reconstruction.choice.matter == "levels"  # else a unit of δ
     train = scan.train()
     absorbs = not scan.exposures.distance.any()  # then δ, where it is told, is β times a ratio that no frame shows
-    if absorbs or not reconstruction.delta_told:
+    delta_told = reconstruction.delta_told and not absorbs
+    if not delta_told:
         volume = of_absorption(volume)
         truth = None if truth is None else of_absorption(truth)
     if absorbs and reconstruction.delta_told:
@@ -112,16 +113,17 @@ def report_run(
         seen=views_seeing(train.exposures, grid) == len(train),
         material_delta=(found.matter.beta if absorbs else found.matter.delta) if material else None,
         explained=reconstruction.verdict,
-        delta_told=reconstruction.delta_told and not absorbs,
+        delta_told=delta_told,
         total=reconstruction.total,
         rehearsal=read_rehearsal(folder),
+        at_rest=not instants_of(folder),
         geometry=reconstruction.geometry,
         lit=_lit(reconstruction, scan, evaluation),
         moving=moving,
         guess=_guess(folder, reconstruction),
         forecast=_forecast(folder),
         decisions=(*([chosen] if chosen else ()), *reconstruction.choice.decisions),
-        view=view_of(turned, volume, truth, scan, reconstruction.delta_told),
+        view=view_of(turned, volume, truth, scan, delta_told),
         history=folder.history(),
         seconds=sum(reconstruction.timing.values()),
         timing={stage: f"{seconds:.1f} s" for stage, seconds in reconstruction.timing.items()},
@@ -177,8 +179,8 @@ def _scan_of(folder: RunFolder) -> str:
 def _title(config: Mapping[str, Any], reconstruction: Reconstruction) -> str:
     found = reconstruction.object
     matter, name = found.matter, NAMES.get(found.kind, f"Reconstruction as {found.described}")
-    count = "δ and β free" if not matter.occupancies else f"{COUNTED.get(len(matter), len(matter))} material"
-    count += "s" if len(matter.others) else ""
+    told = max(len(matter), 1 + len(config["prior"].get("others", ())))  # a volume has one channel for all that is told
+    count = "δ and β free" if not matter.occupancies else f"{COUNTED.get(told, told)} material{'s' * (told > 1)}"
     if not reconstruction.delta_told:
         return f"{name}, of absorption alone"
     said = {"known": ", known", "ratio": " of known δ/β", "free": ", found" if matter.occupancies else ""}
@@ -195,7 +197,7 @@ def _summary(reconstruction: Reconstruction, scan: Scan, moving: Moving | None) 
     if moving is not None:
         state += f" Volumes, slices and projections are those at {1e6 * _middle(moving):.4g} µs."
     return (
-        f"{len(scan.train())} training and {len(scan.test())} held-out frames of {h} × {w} pixels of "
+        f"{len(scan.train())} training and {number_of(len(scan.test()), 'held-out frame')} of {h} × {w} pixels of "
         f"{span(1e6 * views.pixel_sizes)} µm, {beam_named(exposures.energy_kev)[1]}, {distance}; "
         f"{reconstruction.object.described}.{state}"
     )
@@ -279,7 +281,7 @@ def view_of(obj: Stored, volume: Volume, truth: Volume | None, scan: Scan, delta
     exposures = scan.exposures[np.array([0])]
     _, _, pixel = raster_of(*exposures.views.shape, exposures.views.pitch)
     times = np.unique(scan.exposures.time) if isinstance(obj, MovingSurfaces) else None
-    shift = first_phase(obj, scan) * (1.0 if delta_told else 2.0)  # without δ, which is β then: the absorption 2k∫β
+    shift = first_phase(obj, scan, delta_told)
     sign = obj.matter.channels[0].sign
     shown = {"reconstruction": volume} | ({} if truth is None else {"truth": truth})
     parts = {"reconstruction": part_of(obj, volume, pixel, times)}
@@ -299,12 +301,12 @@ def view_of(obj: Stored, volume: Volume, truth: Volume | None, scan: Scan, delta
     )
 
 
-def first_phase(obj: Stored, scan: Scan) -> np.ndarray:
-    """k∫δ [H, W] [rad] in the first view."""
+def first_phase(obj: Stored, scan: Scan, delta_told: bool) -> np.ndarray:
+    """k∫δ [H, W] [rad] in the first view; where δ is not known the absorption 2k∫β."""
     exposures = scan.exposures[np.array([0])]
     with torch.no_grad():
-        _, delta = obj.project(exposures.views)
-    return float(wavenumber(exposures.energy_kev)[0]) * delta[0].numpy()
+        beta, delta = obj.project(exposures.views)
+    return float(wavenumber(exposures.energy_kev)[0]) * (delta if delta_told else 2 * beta)[0].numpy()
 
 
 def phase_ends(phase: np.ndarray, sign: float = 1.0) -> tuple[float, float]:
@@ -319,7 +321,7 @@ def still_picture(phase: np.ndarray, sign: float = 1.0) -> str:
     rows, columns = phase.shape
     figure = new_figure(2.4, 2.4 * rows / columns, layout="none")
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    low, high = phase_ends(phase, sign)
-    axes.imshow(sign * phase, cmap="magma", vmin=sign * low, vmax=sign * high)
+    colours, (low, high) = around_zero(DELTA_MAP, (min(ends := phase_ends(phase, sign)), max(ends)))
+    axes.imshow(phase, cmap=colours, vmin=low, vmax=high)
     axes.axis("off")
     return data_uri(figure, "png")

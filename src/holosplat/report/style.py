@@ -96,9 +96,9 @@ def settings() -> dict[str, object]:
 
 
 @functools.cache
-def palette() -> np.ndarray:
-    """Red, green and blue [256, 3] of `DELTA_MAP`, from dark to light, as whole numbers up to 255."""
-    return np.rint(255 * matplotlib.colormaps[DELTA_MAP](np.arange(256))[:, :3]).astype(int)
+def palette(colours: str = DELTA_MAP) -> np.ndarray:
+    """Red, green and blue [256, 3] of a map of colours, from its low end on, as whole numbers up to 255."""
+    return np.rint(255 * matplotlib.colormaps[colours](np.arange(256))[:, :3]).astype(int)
 
 
 def styled(function: Callable[P, T]) -> Callable[P, T]:
@@ -273,9 +273,14 @@ def largest(values: np.ndarray, percentile: float = ENDS[1]) -> float:
     return float(np.percentile(np.abs(values), percentile)) or 1.0
 
 
-def from_dark(colours: str, limits: tuple[float, float]) -> str:
-    """The map `colours`, reversed where values are mostly negative, so that empty space is always dark."""
-    return colours if limits[1] >= -limits[0] else f"{colours}_r"
+def around_zero(colours: str, limits: tuple[float, float]) -> tuple[str, tuple[float, float]]:
+    """The map and the range for values within `limits`, which hold zero: `colours`, which are dark at zero, or those of
+    differences, white at zero, where values on either side of it take more than one of them."""
+    low, high = limits
+    if min(-low, high) > (high - low) / len(palette()):
+        most = max(-low, high)
+        return SIGNED_MAP, (-most, most)
+    return (colours if high >= -low else f"{colours}_r"), limits
 
 
 def decimal_scale(largest: float) -> tuple[float, str]:

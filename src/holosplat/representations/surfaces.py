@@ -17,6 +17,7 @@ from ..geometry import Grid, Poses, Views
 from ..matter import DeltaBeta, Matter
 from ..mesh import TriangleMesh, joined, part_of, shell_labels, winding_number
 from ..projectors.surface import surface_occupancy, surface_thickness
+from ..units import number_of
 from ..volume import LineIntegrals, Unmoved, Volume
 from .flow import TimeBasis, path_positions
 
@@ -266,7 +267,7 @@ class MovingSurfaces:
     def described(self) -> str:
         """How large it is, in words."""
         of = f"degree {self.basis.degree}" + (f" in {self.basis.pieces} pieces" if self.basis.pieces > 1 else "")
-        return f"{self.count} moving bodies of {len(self.faces)} triangles, paths of {of}"
+        return f"{number_of(self.count, 'moving body')} of {len(self.faces)} triangles, paths of {of}"
 
     def on(self, backend: str) -> MovingSurfaces:
         """The bodies for another backend (resolved); their projector runs on the CPU."""

@@ -16,7 +16,7 @@ from ..io.formats import loader_of, read_frames
 from ..io.lock import is_hidden
 from ..io.reading import Reading
 from ..matter import DeltaBeta, MaterialPrior, MatterKind
-from ..methods import Auto, Method
+from ..methods import Auto, Method, require_possible
 from ..methods.continued import Continued, Effort
 from ..methods.presets import method_of
 from ..motion.track import TrackOptions
@@ -169,6 +169,7 @@ def _source(path: Path, settings: Settings, prior: Callable[[float], MaterialPri
         f"bodies are followed through several times, but {path} has {len(times)}; leave --track.",
     )
     known = prior(scan.exposures.reference_energy)
+    require_possible(settings.method, known, settings.matter)
     return Source(path.resolve(), tuple(times), fingerprint(scan), known)
 
 

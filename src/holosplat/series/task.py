@@ -21,6 +21,7 @@ from ..io.reading import Reading
 from ..metrics import ImageScores
 from ..representations import MovingSurfaces
 from ..scan import Scan
+from ..units import number_of
 from ..workflows.evaluate import Evaluation, evaluate
 from ..workflows.reconstruction import Reconstruction
 from ..workflows.run_folder import RunFolder, claimed
@@ -133,7 +134,7 @@ class _Work:
                     self._write(row)
                     own = replace(own, row=row)
             after = own, shot.scan
-        return f"{len(failed)} times could not be tried again: {failed[0]}" if failed else ""
+        return f"{number_of(len(failed), 'time')} could not be tried again: {failed[0]}" if failed else ""
 
     def _conserved(self) -> str:
         """Try times of spherical matter again with the total δ that the others tell, where it may be conserved
@@ -153,7 +154,8 @@ class _Work:
             failed += [reason] if reason else []
             if row is not None:
                 self._write(row)
-        return f"{len(failed)} times could not be tried with the total of the others: {failed[0]}" if failed else ""
+        some = number_of(len(failed), "time")
+        return f"{some} could not be tried with the total of the others: {failed[0]}" if failed else ""
 
     def _reconstructed(self, moment: Moment, run: RunFolder, before: Before | None) -> Row:
         return reconstruct_time(self._shot(moment), self.plan.settings, run, before)

@@ -22,6 +22,7 @@ from ..progress import PICTURE, FitState
 from ..ranges import Positive, Seconds, ranged
 from ..representations import Stored
 from ..scan import Scan
+from ..units import number_of
 from ..workflows.run_folder import RunFolder
 from .folder import ROW, Folder, Found, Row, outcome_of, plain, read_row, write_row
 from .one_time import PHASE, Before, Shot, quiet, reconstruct_time, write_phase
@@ -332,7 +333,7 @@ class Watch:
         failed = {f"{plain(Path(row.scan).name)}, time {row.frame}": plain(row.reason) for row in bad}
         failed |= {plain(key[0]): plain(one.reason) for key, one in self._failures.items()}
         when = time.strftime("%Y-%m-%d %H:%M:%S")
-        verdict = f"{len(frames)} times are done." if frames else "No scan has come yet."
+        verdict = f"Done: {number_of(len(frames), 'time')}." if frames else "No scan has come yet."
         title = f"Scans of {plain(self.source.resolve().name)}"
         said = f"{state} {when}" + (self._lag and f"; the last time was done {self._lag}")
         begun = self._begun_time and Frame(self._begun_time[0], self._begun_time[0].time_s, self._begun_time[1], "")

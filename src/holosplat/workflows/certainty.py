@@ -128,7 +128,8 @@ class Again:
         taken = next((each.choice for each in reversed(done.choice.decisions) if each.name == STAGE), "")
         light = replace(done.light, noise="correlated" if CORRELATED in taken else "white")
         light = light if done.still is None else LightOptions()  # which finds the fixed pattern, too
-        how = {"prior": self.prior, "method": self.method, "light": light, "matter": done.choice.matter}
+        kind = done.choice.matter if done.choice.matter in self.method.kinds_of_matter else None  # as of older runs
+        how = {"prior": self.prior, "method": self.method, "light": light, "matter": kind}
         return reconstruct(scan, seed=self.seed + further, **(how | changed))
 
 

@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from dataclasses import is_dataclass
 from typing import Any
 
-import numpy as np
-
 from ..checks import as_written, require
 from ..inference import Decision
 from ..io.atomic import read_json
@@ -23,6 +21,7 @@ from ..methods.levels import RATIO, SHOWN
 from ..methods.presets import SCHEMA
 from ..methods.uncertain import Uncertain
 from ..optics.background import LightOptions
+from ..preprocess import require_relative
 from ..scan import Scan
 from ..tables import to_table
 from .provenance import RESUMED_WITH
@@ -105,10 +104,6 @@ def decided_there(method: Method) -> Prepared | None:
 
 FEWEST_COLUMNS = 11
 """Pixels across the axis that are a field of view; rows may be as few as one."""
-FLAT_LEVELS = (0.2, 5.0)
-"""Between these lies the median of frames that are relative to the flat field."""
-MOST_NEGATIVE = 0.25
-"""Share of the pixels that may be below zero: noise makes half of those so that an absorber darkens wholly."""
 
 
 def require_kinds(scan: Scan, prior: MaterialPrior, method: object) -> None:
@@ -140,14 +135,4 @@ def check_frames(train: Scan) -> None:
         w >= FEWEST_COLUMNS,
         f"frames must have at least {FEWEST_COLUMNS} columns, but they are {h} × {w} pixels; take a wider part.",
     )
-    level = float(np.median(train.frames))
-    require(
-        FLAT_LEVELS[0] < level < FLAT_LEVELS[1],
-        f"frames must be relative to the flat field (about 1 beside the sample), but their median is {level:.4g}; "
-        "divide counts by their flats, with --flats and --darks or image_key 1 and 2 in the file.",
-    )
-    negative = float((train.frames < 0).mean())
-    require(
-        negative <= MOST_NEGATIVE,
-        f"frames must be intensities, but {negative:.0%} of their pixels are below zero; take off less of the dark.",
-    )
+    require_relative(train.frames)

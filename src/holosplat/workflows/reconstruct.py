@@ -16,7 +16,7 @@ from ..io.light import read_still_light
 from ..io.volumes import write_guess
 from ..learning.start import GuessedMatter
 from ..matter import MaterialPrior, MatterKind
-from ..methods import Auto, Gaussians, Method, Settled, Task, finished, learned, settled
+from ..methods import Auto, Gaussians, Method, Settled, Task, finished, learned, require_possible, settled
 from ..methods.cross_validation import first_picture
 from ..methods.illumination import prepared
 from ..methods.keeper import Keeper
@@ -88,7 +88,7 @@ def reconstruct(
 
     Ctrl-C (KeyboardInterrupt) ends a fit with the state that it has reached (`finished` is False). Errors: `InputError`
     for scans without training frames or matter, or of several times where `method` takes one, for other folders,
-    and for tasks that the method cannot do.
+    and for tasks and kinds of matter that the method cannot do.
 
     Examples:
 
@@ -114,6 +114,7 @@ def reconstruct(
     if refine is not None:
         scan.views.parallel("finding poses")
     check_frames(scan.train())
+    require_possible(method, prior, matter)
     if not resume:  # a run that goes on may be past them
         method.require_files()
     assumed, ranges, planned = light or LightOptions(), uncertain or Uncertain(), scan

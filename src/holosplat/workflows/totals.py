@@ -139,7 +139,7 @@ def in_words(
         return f"{named} {total.value:.3g} m³ ± {in_percent(total.share)}{volume}{held}"
     sign = math.copysign(1.0, total.held)
     size, reach = sign * total.value, WIDE * total.error
-    low, high = sorted((sign * max(0.0, size - reach), sign * (max(0.0, size) + reach)), key=abs)
+    low, high = sorted((sign * max(0.0, size - reach) + 0.0, sign * (max(0.0, size) + reach)), key=abs)
     volume = "" if delta is None else f" ({low / delta:.2g} to {high / delta:.2g} m³ of the material)"
     cannot = "the frames cannot tell it" if ratio_known else "the frames cannot tell it without the ratio δ/β"
     return f"{named}: {cannot}; between {low:.2g} and {high:.2g} m³{volume}{held}"

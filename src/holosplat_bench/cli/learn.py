@@ -12,6 +12,7 @@ from holosplat.cli.places import Kept, Output
 from holosplat.cli.progress import ProgressBar
 from holosplat.cli.sentence import interruptible, tell
 from holosplat.ranges import Jobs, Seed, Within
+from holosplat.units import number_of
 
 from ..training.options import Ranges, TrainOptions
 
@@ -57,10 +58,10 @@ def dataset(
             export(wanted, layout, lambda part, layout=layout: bar.show(f"{layout} files", part, {}))
             for layout in layouts
         ]
-    print(f"wrote {made} files of scenes; {out / 'datasheet.md'} says what they are")
+    print(f"wrote {number_of(made, 'file')} of scenes; {out / 'datasheet.md'} says what they are")
     for each in done:
         left_out = f"; left out, for their views have no common axis: {len(each.left_out)}" if each.left_out else ""
-        print(f"wrote {each.count} scene{'s' * (each.count > 1)} into {each.folder}{left_out}")
+        print(f"wrote {number_of(each.count, 'scene')} into {each.folder}{left_out}")
 
 
 def _needs(drawn: Ranges, scenes: int, jobs: int) -> Needs:

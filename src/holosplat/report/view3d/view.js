@@ -328,6 +328,13 @@ function shade(low, high, colours) {
   };
 }
 
+// Ends and colours of values from low to high: white at zero where they take more than one colour on either side of it.
+function aroundZero(low, high) {
+  const [least, most] = [Math.min(low, high), Math.max(low, high)], far = Math.max(-least, most);
+  if (Math.min(-least, most) > (most - least) / 256) return [[-far, far], shade(-far, far, facts.signed)];
+  return [[low, high], shade(low, high, facts.colours)];
+}
+
 // A number as people write it: 1.2e-7 becomes 1.2 × 10⁻⁷.
 function text(value) {
   if (!value) return "0";
@@ -381,7 +388,7 @@ function start(buffer) {
   const told = facts.delta_told, [name, unit, factor] = told ? ["Phase shift −φ", "rad", facts.k] : ["Absorption 2k∫β dz", "", 2 * facts.k];
   const lined = ({ delta, beta }) => (told ? delta : beta);
   const [cutName, cutUnit, cutFactor] = told ? ["δ", "", 1] : ["µ", "m⁻¹", 2 * facts.k];
-  const warm = shade(...facts.phase, facts.colours), grey = shade(...facts.grey);
+  const [ends, warm] = aroundZero(...facts.phase), grey = shade(...facts.grey);
   let shown, pending = 0;
 
   function look() {
@@ -398,8 +405,7 @@ function start(buffer) {
     state.depth = Math.min(state.depth, count - 1);
     const { w, h, values } = sliceOf(part, arrays, state.plane, state.depth);
     const [low, top] = part.ends[0], full = top || (low < 0 ? 0 : 1);
-    const ends = -low > full ? [full, low] : [low, full];  // what fills the field is dark
-    const colour = shade(...ends, facts.colours);
+    const [ends, colour] = aroundZero(...(-low > full ? [full, low] : [low, full]));  // what fills the field is dark
     paint(pick("slice"), w, h, values, colour);
     bar("slice", ...ends, colour, cutUnit, cutFactor);
     ruler("slice", w * facts.pixel * part.voxel[[2, 0, 0][state.plane]]);
@@ -450,7 +456,7 @@ function start(buffer) {
   };
   pick("shown").textContent = name;
   pick("slice-shown").textContent = `Slice of ${cutName}`;
-  bar("phase", ...facts.phase, warm, unit);
+  bar("phase", ...ends, warm, unit);
   bar("hologram", ...facts.grey, grey);
   for (const each of ["phase", "hologram"]) ruler(each, columns * facts.pixel);
   state.depth = Math.floor((Object.values(slices)[0]?.arrays.values.shape[1] ?? 1) / 2);

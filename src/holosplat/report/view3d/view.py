@@ -27,7 +27,7 @@ from ...representations import GaussianCloud, MovingSurfaces, Stored, SurfaceMes
 from ...scan import Exposures
 from ...units import wavenumber
 from ...volume import Volume
-from ..style import palette
+from ..style import SIGNED_MAP, palette
 
 MOST_COLUMNS = 320
 """Raster pixels along the longer edge of the view's frame."""
@@ -111,6 +111,7 @@ def packed(view: View3D) -> tuple[dict[str, Any], bytes]:
         "phase": view.ends,
         "delta_told": view.delta_told,
         "colours": palette().ravel().tolist(),
+        "signed": palette(SIGNED_MAP).ravel().tolist(),
     }, bytes(blob)
 
 

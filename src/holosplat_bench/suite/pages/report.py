@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from holosplat.checks import require
 from holosplat.report.page import Headline, duration
 from holosplat.report.style import format_length, scientific
-from holosplat.units import span
+from holosplat.units import number_of, span
 
 from ..folder import BenchFolder, Row
 from ..pictures import TRUTH
@@ -64,9 +64,9 @@ def verdict(cases: Sequence[CaseResult]) -> str:
         parts.append(f"{measure.name} in {first}")
     lost = sum(bool(beaten(case, measure)) for case in shared for measure in HEADLINE)
     failed = sum(bool(method.reasons) for case in shared for method in case.methods if method.name == OURS)
-    text = f"Of {_counted(len(shared), 'case')}, {OURS} is best in {', '.join(parts)}; "
+    text = f"Of {number_of(len(shared), 'case')}, {OURS} is best in {', '.join(parts)}; "
     text += f"another method is ahead of it in {lost} of {len(shared) * len(HEADLINE)} comparisons."
-    return text + (f" It failed on {_counted(failed, 'case')}." if failed else "")
+    return text + (f" It failed on {number_of(failed, 'case')}." if failed else "")
 
 
 def summary_table(cases: Sequence[CaseResult]) -> ScoreTable:
@@ -161,7 +161,7 @@ def case_facts(case: CaseResult) -> list[str]:
     seeds, named = ", ".join(map(str, case.seeds)), [f"{text}." for text in (facts["summary"],) if text]
     return [
         *named,
-        f"{_counted(facts['training_frames'], 'training frame')} and {facts['held_out_frames']} held out, {axis}, of "
+        f"{number_of(facts['training_frames'], 'training frame')} and {facts['held_out_frames']} held out, {axis}, of "
         f"{rows} × {columns} pixels of {format_length(facts['pixel_size_m'])}, {facts['energy_kev']:g} keV, "
         f"{span(1e3 * np.array(facts['distance_m']))} mm behind the sample, point-spread function of "
         f"{span(np.array(facts['psf_sigma_px']))} pixels, {photons}. Methods are told {_prior(facts['prior'])}. "
@@ -209,10 +209,6 @@ def _occurring(texts: Sequence[str]) -> str:
     if len(counts) == 1:
         return texts[0]
     return "; ".join(f"{text} ({count} rows)" for text, count in counts.items())
-
-
-def _counted(count: int, noun: str) -> str:
-    return f"{count} {noun}{'s' * (count != 1)}"
 
 
 DOWN = "All axes are logarithmic, and better is further down and to the left."
