@@ -99,8 +99,9 @@ def _mass(cloud: GaussianCloud) -> Tensor:
 def _inertial(flow: Flow, times: list[float]) -> list[dict[str, Tensor]]:
     """The potentials at `times`, of which the first is that of the flow.
 
-    In each step a place gets the velocity of where its fluid came from (Stam 1999, SIGGRAPH, 121, with the midpoint
-    rule), and of flows without divergence the one next to that is taken, in the mean square over all space.
+    A step gives each place the velocity of where its fluid came from (Stam 1999, SIGGRAPH, 121, by the midpoint rule)
+    and projects these velocities onto flows without divergence, by least squares over the lattice. Fluid beyond it is
+    at rest.
     """
     require(flow.sources is None, "inertia needs a flow without sources, but this one has some; take --by steady.")
     constant = TimeBasis(flow.basis.first, flow.basis.last, 0)
