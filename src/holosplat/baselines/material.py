@@ -19,8 +19,10 @@ from .tomography import TotalVariation, plateau, tv_solver
 
 LIKELY_RATIOS = (56.0, 18_000.0)
 """δ/β that matter may have of which nothing is known: heavy elements at low energy, soft matter at high energy."""
-RATIOS = tuple(float(ratio) for ratio in np.geomspace(LIKELY_RATIOS[1], LIKELY_RATIOS[0], 6))
-"""Those of first volumes, the largest first: half a decade changes how far absorption blurs a volume by √3."""
+RATIOS = tuple(float(ratio) for ratio in np.geomspace(LIKELY_RATIOS[1], LIKELY_RATIOS[0], 7))
+"""Those of first volumes, the largest first: a step changes how far absorption blurs a volume by 1.6."""
+USUAL_RATIO = RATIOS[len(RATIOS) // 2]
+"""δ/β where frames do not tell it, about 1000: that of soft matter and light elements is 300 to 3000 at 8 to 30 keV."""
 TRIAL_DELTA = 1e-6
 """The retrieved D = δT does not depend on it, but what a weight of total variation means does."""
 

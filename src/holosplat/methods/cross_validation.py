@@ -19,7 +19,7 @@ from ..baselines import HolographicTV, holographic_tv
 from ..baselines.algebraic import Algebraic, sirt
 from ..baselines.beyond import margins_of
 from ..baselines.holographic_tv import Correction, retrieved
-from ..baselines.material import DEFAULT, RATIOS, MaterialEstimate, estimate_delta
+from ..baselines.material import DEFAULT, RATIOS, USUAL_RATIO, MaterialEstimate, estimate_delta
 from ..checks import InputError
 from ..fit.whitened import WhitenedFrames
 from ..frames import evenly
@@ -94,9 +94,6 @@ class MissingMatter:
 PICTURE_WIDTH, PICTURE_VIEWS = 48, 32
 """Frames of a first picture are binned to about so many pixels, and it takes so many of them at most: on one core it is
 there in half a second."""
-PICTURE_RATIO = 1000.0
-"""δ/β of a first picture where it is not known, which only its blur depends on: that of soft matter and light elements
-is 300 to 3000 at 8 to 30 keV."""
 PICTURE_SWEEPS = Algebraic(sweeps=20, relaxation=1.9, nonnegative=True)
 """Sweeps of its tomography: more change nothing that is seen."""
 WIDTH = 64
@@ -132,7 +129,7 @@ def first_picture(train: Scan, prior: MaterialPrior) -> VoxelGrid:
     one = train.at_instant(len(train.instants) // 2) if train.is_series else train
     one = one[evenly(len(one), PICTURE_VIEWS)]
     scan = one.binned(one.largest_binning(math.ceil(max(one.views.shape) / PICTURE_WIDTH)))
-    ratio = prior.ratio if isinstance(prior, KnownRatio) else prior.delta_sign * PICTURE_RATIO
+    ratio = prior.ratio if isinstance(prior, KnownRatio) else prior.delta_sign * USUAL_RATIO
     delta = prior.delta_sign * 1e-6  # any: the thickness is found in its units
     delta, beta = prior.materials[0] if prior.materials else DeltaBeta(delta, delta / ratio)
     known = {"missing": scan.gaps, "two_sided": prior.two_sided}
@@ -263,13 +260,13 @@ class FirstVolumes:
 
 
 def unseen_ratio(first: FirstVolumes) -> tuple[float, Decision]:
-    """δ/β whose volumes of frames as measured predict unseen ones better than those of any larger one of `RATIOS` do;
-    by a parabola through their residuals, between this and those beside it.
+    """δ/β whose volumes of frames as measured predict unseen ones better than those of any of `RATIOS` nearer to
+    `USUAL_RATIO`, the null; by a parabola through their residuals, between this and those beside it.
 
-    The null is the largest, of matter that absorbs least, for absorption may also stand for what else the model lacks.
     Where there is no matter of a ratio, its prediction is even light.
     """
     tried = {f"{ratio:.6g}": first.at_ratio(ratio) for ratio in RATIOS}
+    outwards = sorted(tried, key=lambda name: abs(math.log(float(name) / USUAL_RATIO)))
 
     @cache
     def score(name: str, fold: int) -> Score:
@@ -279,7 +276,7 @@ def unseen_ratio(first: FirstVolumes) -> tuple[float, Decision]:
             return without_matter(first, fold)
 
     first.on_progress(UNSEEN_RATIO, 0.0)
-    decision = select(UNSEEN_RATIO, tuple(tried), score, first.folds.count, by=first.folds.by)
+    decision = select(UNSEEN_RATIO, outwards, score, first.folds.count, by=first.folds.by)
     at = list(tried).index(decision.choice)
     if not 0 < at < len(tried) - 1:
         return RATIOS[at], decision

@@ -171,11 +171,11 @@ def decide_ratio(
 ) -> tuple[FirstVolumes, tuple[Decision, ...]]:
     """First volumes of a task of which nothing is known at its δ/β, and whether frames as measured need that.
 
-    The null is the largest of `LIKELY_RATIOS`, of matter that absorbs least. The likeliest one (`likeliest_ratio`), or
-    where the likelihood tells none, or is not asked (`likely`), that of `FirstVolumes.ratio`, is taken where first
-    volumes of such matter predict unseen frames better than those of the null do, as measured, and both in the light
-    that each calls for (`lit`): absorption may stand for light, and light for absorption. In light or noise that was
-    taken, which were found at the first δ/β, nothing is decided.
+    The null is the likeliest one (`likeliest_ratio`), or where the likelihood tells none, or is not asked (`likely`),
+    that of `FirstVolumes.ratio`. The largest of `LIKELY_RATIOS`, of matter that absorbs least, is taken where first
+    volumes of such matter predict unseen frames better, as measured, or both in the light that each calls for (`lit`):
+    absorption may stand for light, and light for absorption. In light or noise that was taken, which were found at the
+    first δ/β, nothing is decided.
     """
     found, decision = _ratio(task, first, lit, likely)
     if decision is None:
@@ -200,7 +200,8 @@ def _compared(task: Task, first: FirstVolumes, lit: Lit | None, likely: bool) ->
     if first.taken:
         return found, None
     found = replace(found, value=float(f"{found.value:.4g}"))  # as the decision names it, so that runs may go on
-    tried = {f"{each.value:.4g}": each for each in (replace(found, value=most, high=most, told=False), found)}
+    tried = {f"{found.value:.4g}": found}
+    tried.setdefault(f"{most:.4g}", replace(found, value=most, high=most, told=False))
     trials = {name: Trials(first.at_ratio(each.value), task.light) for name, each in tried.items()}
 
     def decided(light: Mapping[str, Hypothesis], by: str) -> Decision:
