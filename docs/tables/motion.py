@@ -166,7 +166,7 @@ def matter_ahead() -> str:
     named = {"stir4": "stirred", "drift4": "drifting"}
     rows = {(row["case"], int(row["ahead"]), row["way"]): row for row in read("flow_forecast.csv")}
     lines = []
-    for case, ahead in sorted({key[:2] for key in rows}, reverse=True):
+    for case, ahead in sorted({key[:2] for key in rows}, key=lambda key: (list(named).index(key[0]), key[1])):
         ways = [rows[case, ahead, way] for way in ("still", "steady", "inertia", "auto")]
         errors, places = ([rounded(row[name], 3) for row in ways] for name in ("error", "places_since"))
         lines.append([named[case], str(ahead), *errors, f"{places[-1]} µm", f"{rounded(ways[-1]['band'], 3)} µm"])
