@@ -21,6 +21,16 @@ def test_errors_and_scores_are_drawn_in_micrometres_and_microseconds():
         np.testing.assert_allclose(np.asarray(line.get_ydata(), dtype=float), [row[name] for row in SCORES])
 
 
+def test_matter_in_motion_has_no_bodies():
+    """Neither a legend of them nor a caption."""
+    shown = ForecastShown(TIMES, BAND[:, :1], SCORES, of_bodies=False)
+    assert not forecast_figure(shown).legends
+    assert forecast_figure(ForecastShown(TIMES, BAND, SCORES)).legends
+    assert "body" not in forecast_block(shown).caption
+    assert "bodies" not in forecast_block(shown).caption
+    assert "the places of matter along an axis" in forecast_block(shown).caption
+
+
 def test_what_is_missing_is_said():
     text = forecast_block(ForecastShown(TIMES, np.nan * BAND)).caption
     assert "Errors were not estimated" in text

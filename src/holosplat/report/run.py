@@ -167,7 +167,8 @@ def _forecast(folder: RunFolder) -> ForecastShown | None:
         return None
     times, band = read_band(folder)
     said = read_json(folder.path / NUMBERS)
-    return ForecastShown(times, band, said["held_out"], flow_in_words(said["flow"]) if said.get("flow") else "")
+    flow = flow_in_words(said["flow"]) if said.get("flow") else ""
+    return ForecastShown(times, band, said["held_out"], flow, said.get("of", "bodies") == "bodies")
 
 
 def _scan_of(folder: RunFolder) -> str:

@@ -292,7 +292,8 @@ BUSY = 16
 class ForecastShown:
     """A forecast, as data.
 
-    - times: [N] s; band: [N, B] m, standard error of each body's surface along its normals, NaN where nothing tells it
+    - times: [N] s; band: [N, B] m, standard error of each body's surface along its normals, or [N, 1] of the places of
+      matter along an axis, NaN where nothing tells it; of_bodies: which of the two
     - flow: what mechanics found of the flow, and what they cannot tell, in words
     - held_out: scores of frames that the run did not see, a row a time: time_s, ssim, and ssim_still, of bodies that
       stay where they were
@@ -302,6 +303,7 @@ class ForecastShown:
     band: np.ndarray
     held_out: Sequence[Mapping[str, float]] = ()
     flow: str = ""
+    of_bodies: bool = True
 
 
 def forecast_block(shown: ForecastShown) -> Block:
@@ -310,15 +312,19 @@ def forecast_block(shown: ForecastShown) -> Block:
     if not told and not shown.held_out:
         return Block(heading, "Errors were not estimated, and the scan has no frames of the forecast's times.")
     text = "Over the time of the scan. "
+    of = (
+        "each body's surface along its normals, root mean square over it"
+        if shown.of_bodies
+        else ("the places of matter along an axis, root mean square by mass")
+    )
     text += (
-        "a, standard error of each body's surface along its normals, root mean square over it, from fits to halves of "
-        "the frames and from a forecast of the last known time. "
+        f"a, standard error of {of}, from fits to halves of the frames and from a forecast of the last known time. "
         if told
         else "a, errors were not estimated. "
     )
     text += (
         f"b, structural similarity of predicted frames with {len(shown.held_out)} that the run did not see, and of "
-        "frames of bodies that stay where they were. "
+        f"frames of {'bodies that stay where they were' if shown.of_bodies else 'matter that stays as it was'}. "
         if shown.held_out
         else "b, the scan has no frames of these times."
     )
@@ -345,9 +351,10 @@ def forecast_figure(shown: ForecastShown) -> Figure:
         scores.legend(loc="lower left")
     for i, axes in enumerate((errors, scores)):
         letter(axes, i)
-    handles, labels = errors.get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="outside right center", title="body", ncols=-(-count // BUSY), handlelength=1.0,
-        title_fontsize=6.5,
-    )  # fmt: skip
+    if shown.of_bodies:
+        handles, labels = errors.get_legend_handles_labels()
+        figure.legend(
+            handles, labels, loc="outside right center", title="body", ncols=-(-count // BUSY), handlelength=1.0,
+            title_fontsize=6.5,
+        )  # fmt: skip
     return figure

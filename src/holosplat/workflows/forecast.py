@@ -284,6 +284,7 @@ def write_forecast(folder: RunFolder, run: Reconstruction, found: Forecasted) ->
             "times_s": said.times.tolist(),
             "band_m": band,
             "held_out": found.judged,
+            "of": "bodies" if of_bodies else "matter",
             "flow": said.told if of_bodies else {},
             "decision": found.decision and found.decision.as_dict(),
         },
