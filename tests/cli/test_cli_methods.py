@@ -37,7 +37,7 @@ TITLES = {
     "gaussians": "Gaussian reconstruction",
     "surfaces": "Reconstruction as closed surfaces",
     "voxels": "Voxel reconstruction",
-    "neural-field": "Reconstruction as a neural field",
+    "neural-field": "Reconstruction as a field of ",
 }
 FILES = {"manifest.json", "config.json", "metrics.csv", "object.h5", "summary.json", "source.json", "report.html"}
 FILES.add("provenance.json")
