@@ -32,8 +32,9 @@ UNSEEN = 0.01
 """Refraction that changes the contrast of the finest detail by less than this share of its absorption is not seen."""
 LEAST_INTENSITY = 1e-6
 """Intensity taken for the darkest pixel's, where frames have no noise that would set it."""
-FINEST = 4
-"""Times the samples of fits by which the frames of steep walls are known."""
+FINEST, FINEST_ROW = 4, 16
+"""Times the samples of fits by which the frames of steep walls are known; and where all rows are alike, so that one
+tells them."""
 DARKEST = 1e-3
 """Least intensity behind a wall that frames are divided by."""
 
@@ -112,6 +113,7 @@ def seen(exposures: Exposures, thickness: Tensor, material: tuple[float, float],
     for index in alike(exposures, s):
         part = exposures[index]
         (my, mx), optical = padding(part, s), part.optical
+        my = 0 if thickness.shape[1] == 1 else my  # what goes on as at the edge has no edge along one row
         wide = pad(thickness[index][:, None], (mx, mx, my, my), mode="replicate")
         fine = interpolate(wide, scale_factor=s, mode="bilinear", align_corners=False)[:, 0]
         units = [wavenumber(part.energy_kev) * share for share in part.refraction(1.0, 1.0)[::-1]]
@@ -130,7 +132,8 @@ def seen(exposures: Exposures, thickness: Tensor, material: tuple[float, float],
 
 
 def beside_faces(exposures: Exposures, few: Tensor) -> Tensor:
-    """What frames `few` [V, H, W] of a wall alone lack, [V, H, W]: those of `FINEST` times finer samples less them.
+    """What frames `few` [V, H, W] of a wall alone lack, [V, H, W]: those of `FINEST` times finer samples, or of one row
+    of `FINEST_ROW` times finer ones, less them.
 
     At flat faces along the beam waves have no end of high frequencies, and samples that hold those of what is inside
     lack them; what they miss of the wall's own frame is the most of it.
@@ -139,7 +142,8 @@ def beside_faces(exposures: Exposures, few: Tensor) -> Tensor:
     rows = 1 if views.shares_axis else views.shape[0]
     exposures = replace(exposures, views=replace(views, shape=(rows, views.shape[1])))
     nothing = few.new_zeros((len(views), rows, views.shape[1]), device="cpu")
-    return seen(exposures, nothing, (1.0, 0.0), FINEST * fringe_sampling(exposures)).to(few) - few
+    finer = (FINEST_ROW if rows == 1 else FINEST) * fringe_sampling(exposures)
+    return seen(exposures, nothing, (1.0, 0.0), finer).to(few) - few
 
 
 def without_wall(
