@@ -56,6 +56,24 @@ def test_flat_faces_along_the_beam(phase, turned):
     assert error(measure(slab, taken, 4, torch.float64)[0].numpy()) > 0.05
 
 
+@pytest.mark.parametrize("faces", [True, False])
+def test_views_of_faces_along_the_beam_have_twice_the_samples(faces):
+    """Unless their number is told; and no others do: those of a ball, and of the same box at an angle."""
+    views = Views.from_angles([0.0] if faces else [30.0, 0.0], (9, 31), 1e-6)
+    taken = Exposures.of(views, 20.0, 0.02)
+    box = MeshScene((box_mesh((-6e-6, -1e-4, -9e-6), (5e-6, 1e-4, 9e-6)),), (DeltaBeta(DELTA, 0.0),))
+    usual = Simulation().samples(taken)
+    objects = [box] if faces else [box, ball(6e-6, DELTA)]
+    for k, obj in enumerate(objects):
+        one = taken[[k]]
+        found, fine = (
+            next(simulated_frames(obj, one, how)) for how in (Simulation(), Simulation(oversample=2 * usual))
+        )
+        plain = next(simulated_frames(obj, one, Simulation(oversample=usual)))
+        assert np.array_equal(found, fine) is faces
+        assert np.array_equal(found, plain) is not faces
+
+
 @pytest.mark.parametrize("delta", [4e-7, 1.2e-6, 1e-5])
 def test_round_edges_are_sampled_as_they_were(delta):
     """Bit for bit, on six samples a pixel: the mean of the wave would lose light there."""

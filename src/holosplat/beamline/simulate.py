@@ -82,7 +82,7 @@ class Simulation:
     seed: Seed = 0
     """Seed of the noise."""
     oversample: int | None = None
-    """Samples a pixel (default: as many as the fringes need)."""
+    """Samples a pixel (default: as many as the fringes need, and twice as many where faces lie along the beam)."""
     shutter: Shutter = Shutter()
     """Length of an exposure (default: no motion blur)."""
     light: UnevenLight = EVEN_LIGHT
@@ -165,6 +165,12 @@ class _Sharp:
                 there.copy_(torch.where(jumps[n], mean[:, n], there))
         return lines[0], lines[1]
 
+    @property
+    def has_faces(self) -> bool:
+        """Whether flat faces lie along the beam: whether the phase may jump within a pixel."""
+        k, (delta, _) = wavenumber(self.exposures.energy_kev), self.exposures.refraction(1.0, 1.0)
+        return bool(_may_jump(float((k * delta)[0]) * self._lines(self.exposures.views)[1, 0]).any())
+
     def _lines(self, views: Views) -> torch.Tensor:
         """B and D as one, [2, V, H, W] m."""
         lines = LineIntegrals.of_any(self.obj.project(views))
@@ -204,8 +210,11 @@ def simulated_frames(obj: Object, exposures: Exposures, how: Simulation = Simula
     obj = obj.on(backend) if isinstance(obj, (MeshScene, MeshSeries)) else obj
     with memory_kept():
         for i in range(len(exposures)):
-            instrument = Instrument(exposures[[i]], fine, torch.float32, "reference", on=device(backend))
-            model = Model(_Sharp(obj, exposures[[i]]) if isinstance(obj, MeshScene | MeshSeries) else obj, instrument)
+            one = exposures[[i]]
+            meshes = _Sharp(obj, one) if isinstance(obj, MeshScene | MeshSeries) else None
+            finer = 2 if meshes is not None and how.oversample is None and meshes.has_faces else 1
+            instrument = Instrument(one, finer * fine, torch.float32, "reference", on=device(backend))
+            model = Model(obj if meshes is None else meshes, instrument)
             frame = np.zeros(exposures.views.shape)
             for offset in how.shutter.offsets:
                 frame += model.frames(delay=float(offset))[0].cpu().numpy()
@@ -231,7 +240,8 @@ def simulate(
     exposures: pose, energy, distance, blur and time of each of the N frames
     photons_per_pixel: mean counts of the Poisson noise (default: no noise)
     is_test: [N] bool, the frames to hold out (default: every fourth)
-    oversample: samples along a pixel (default: as many as the fringes need)
+    oversample: samples along a pixel (default: as many as the fringes need, and twice as many in views of meshes with
+        flat faces along the beam)
     shutter: length of the exposures, for motion blur (default: none)
     light: deviations of the light from the flat field (default: none)
 
