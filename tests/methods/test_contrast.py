@@ -142,7 +142,7 @@ def test_a_crack_is_a_hole_that_fitted_frames_tell():
     """Of a thin crack through the field, which views along it show."""
     kind = MATTER["crack"](44e-6)
     air, medium = (parse_material(name).delta_beta(20.0) for name in ("air", "PMMA"))
-    drawn = kind.drawn(Substances(air, None, medium), 1)
+    drawn = kind.drawn(Substances(air, None, medium), 3)
     views = Views.evenly_spaced(8, shape=(44, 44), pixel_size=PIXEL)
     scan = simulate(
         drawn.scene, Exposures.of(views, 20.0, 0.1), photons_per_pixel=3000.0, seed=1, is_test=np.zeros(8, bool)
