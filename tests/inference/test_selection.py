@@ -108,28 +108,6 @@ def test_what_one_fold_leaves_open_all_of_them_decide():
     assert select("name", ["null", "other"], score, 4, by="views").choice == "other"
 
 
-@pytest.mark.parametrize(("factors", "followed"), [((0.5, 0.55), 2), ((0.5, 0.87), 3)])
-def test_a_candidate_that_surely_wins_is_taken_before_the_last_fold(factors, followed):
-    """Two folds of three are enough where it wins by 2.45 standard errors, and not where it wins by two."""
-    asked = []
-
-    def score(name, fold):
-        asked.append((name, fold))
-        return Score.of((1.0 if name == "null" else torch.tensor(factors)[:, None, None]) * noise((2, 32, 32), fold))
-
-    found = select("name", ["null", "other"], score, 3, by="views")
-    assert found.choice == "other"
-    assert {fold for _, fold in asked} == set(range(followed))
-    two = Compared("other", *gain_of(score, 2))
-    assert two.wins
-    assert two.wins_by(2 / 3) is (followed == 2)
-
-
-def gain_of(score, folds: int) -> tuple[float, float]:
-    mine, null = (Score.joined([score(name, fold) for fold in range(folds)]) for name in ("other", "null"))
-    return mine.gain_over(null)
-
-
 def test_a_candidate_that_cannot_win_is_not_followed():
     """A residual of .995 times the null's in every block is less than the margin, whatever other folds say."""
     asked = []

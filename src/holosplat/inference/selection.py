@@ -121,11 +121,6 @@ class Compared:
         """Whether the gain is sure and of practical size."""
         return self.gain > self._sure
 
-    def wins_by(self, share: float) -> bool:
-        """Whether it wins by so large a `share` of the frames that the others need not be asked, by the bound of
-        O'Brien & Fleming (1979), which leaves the errors of the whole test nearly as they are."""
-        return self.gain > max(ERRORS / math.sqrt(share) * self.error, self.least)
-
     @property
     def loses(self) -> bool:
         """Whether a loss is."""
@@ -205,20 +200,19 @@ def select(
     candidates: the null first, then from simple to complex; score: of a candidate on the unseen frames of a fold, kept
     by the caller; folds: how many there are. Folds are looked at one after another, as long as the candidate may win by
     those before; it is taken only if it wins over all of them, where the frames, and not their blocks, give the
-    standard error (frames differ by more than their parts do), or over two and more of them surely enough
-    (`Compared.wins_by`). by: how unseen frames came about; beside: other names that a candidate must win against, too.
-    surely, least: whether a gain must be sure, and the practical size that it must have. Where another score has told
-    that it is sure, its size is enough; where another has told its size (`least` is 0), it need only be sure.
+    standard error: frames differ by more than their parts do. by: how unseen frames came about; beside: other names
+    that a candidate must win against, too. surely, least: whether a gain must be sure, and the practical size that it
+    must have. Where another score has told that it is sure, its size is enough; where another has told its size
+    (`least` is 0), it need only be sure.
     """
     require(len(candidates) > 0, "a selection needs at least one candidate, but there is none.")
     began, best, compared = time.perf_counter(), candidates[0], list[Compared]()
     for candidate in candidates[1:]:
         rivals = (best, *(beside or {}).get(candidate, ()))
         found = _weakest(candidate, rivals, score, range(1), least)
-        for seen in range(2, folds + 1):
-            if not found.open or (seen > 2 and found.wins_by((seen - 1) / folds)):
-                break
-            found = _weakest(candidate, rivals, score, range(seen), least)
+        for last in range(1, folds):
+            if found.open:
+                found = _weakest(candidate, rivals, score, range(last + 1), least)
         compared.append(found)
         if found.wins or (found.large and not surely):
             best = candidate
