@@ -59,9 +59,9 @@ QUICK: dict[str, Method] = {
 }
 """Every method of one time, with options that take seconds."""
 FITTED = ("gaussians", "surfaces", "voxels", "neural-field", "onix", "pixelnerf")
-LEAST = {"neural-field": 0.4, "pixelnerf": 0.4, "paganin-sirt": 0.3, "paganin-fbp": 0.1}
+LEAST = {"neural-field": 0.4, "pixelnerf": 0.4, "paganin-sirt": 0.3, "paganin-fbp": 0.1, "onix": 0.85}
 """Correlation of held-out frames: after few steps, or without fringes and with streaks, it is small but there."""
-LEAST_BY_RATIO = {**LEAST, "gaussians": 0.5, "surfaces": 0.7, "onix": 0.85}
+LEAST_BY_RATIO = {**LEAST, "gaussians": 0.5, "surfaces": 0.7}
 """δ is estimated at 0.6 of the balls' there, by which overfull Gaussians lose matter in their first steps."""
 REPEATED = {"surfaces": "known", "auto": "ratio"}
 """With which prior a method runs twice, where that is not `unknown`."""
