@@ -155,6 +155,7 @@ PAGES: dict[str, Small] = {
         {
             "grow": "--cells 3 --box 30e-6 16e-6 16e-6 --snapshots 50 --frequency 3 --device cpu",
             "train": "--steps 2 --device cpu",
+            "simulate": "--detector 12 15",
             "forecast": "--times 5",
         },
         "32e-6",
