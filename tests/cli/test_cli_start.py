@@ -10,7 +10,7 @@ import sys
 import pytest
 
 from helpers.cli import holosplat, worked
-from holosplat.cli.entry import COMMANDS, LATE, command
+from holosplat.cli.entry import COMMANDS, command, is_late
 
 HEAVY = ("torch", "scipy", "h5py", "xraydb", "vtk", "vtkmodules", "matplotlib", "jinja2", "tifffile", "PIL", "triton")
 LIGHT = (
@@ -19,7 +19,7 @@ LIGHT = (
 )
 IN_A_TENTH = {"h5py", "tifffile", "PIL", "jinja2"}
 """What other commands than `LIGHT` may load, which takes a tenth of a second."""
-OTHERS = [name for name, (module, *_) in COMMANDS.items() if module not in LATE and [name] not in LIGHT]
+OTHERS = [name for name, (module, *_) in COMMANDS.items() if not is_late(module) and [name] not in LIGHT]
 
 
 def loaded(arguments: list[str]) -> tuple[str, list[str]]:

@@ -193,10 +193,15 @@ def _said(error: BaseException) -> str:
     return f" ({text[:LONGEST]})" if text else ""
 
 
+def is_late(module: str) -> bool:
+    """Whether the module of a command, of whatever package, is one of `LATE`."""
+    return module.rpartition(".")[2] in LATE
+
+
 def command(name: str) -> Callable[..., None]:
     """The function of the command `name`, a key of `COMMANDS`, whose numbers are checked; imports its module."""
     module = COMMANDS[name][0]
-    if module in LATE:
+    if is_late(module):
         say_that_libraries_load()
     found = import_module(f".{module}", __package__) if name in COMMANDS.own else import_module(module)
     return with_checked_arguments(getattr(found, name))
