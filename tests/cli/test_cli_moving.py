@@ -119,6 +119,10 @@ def test_matter_may_fade(quick):
     assert found.fading is not None
     assert float(found.fading.abs().max()) > 1e-4
     assert json.loads((quick / "run/config.json").read_text())["method"]["fading"] == 0.3
+    refused = holosplat("forecast", quick / "run", "--times", 1, "--out", quick / "none")
+    assert refused.code == 2
+    assert "reconstruct without --fading" in refused.err
+    assert not (quick / "none").exists()
 
 
 def test_two_materials_in_motion_are_refused_or_said_to_be_left(quick, capsys):
@@ -162,7 +166,7 @@ def test_matter_in_motion_is_forecast(quick, monkeypatch):
     assert read_volume(quick / "v.h5").delta.max() > 0
     chosen = worked(holosplat("forecast", run, "--times", 1, "--by", "inertia", "--no-half-sets", "--out", quick / "i"))
     assert "standard error of places: not told" in chosen.out
-    for way, why in (("rigid", "--by must be auto, steady, inertia or paths"), ("graph", "--by must be auto, steady")):
+    for way, why in (("rigid", "steady, inertia or paths"), ("graph", "--by must be auto, rest")):
         refused = holosplat("forecast", run, "--times", 1, "--by", way, "--out", quick / "none")
         assert refused.code == 2
         assert why in refused.err

@@ -123,6 +123,13 @@ def test_the_fitted_change_goes_on_by_paths():
     assert steady == pytest.approx(before.at(1.0).centres + way, abs=2e-3)
 
 
+def test_matter_at_rest_stays_as_it_is():
+    before = matter(drift)
+    later = gone_on(before, 1.0, AHEAD, "rest")
+    for ours, theirs in zip(later.at(2.0).parameters().values(), before.at(1.0).parameters().values()):
+        assert ours == pytest.approx(theirs, abs=1e-4)
+
+
 def test_a_flow_with_sources_has_no_inertia():
     before = matter(drift)
     with_sources = replace(before.flow, sources=torch.zeros_like(before.flow.potential[:, 0]))
@@ -163,7 +170,8 @@ def test_a_forecast_is_where_matter_goes_within_its_error(drifting):
     found, decision, way = forecast_matter(history(matter, scan), ahead, None, True, lambda stage, part: None)
     assert decision is not None
     assert (decision.name, decision.choice) == (NAME, way)
-    assert [each.name for each in decision.compared] == ["inertia"]
+    assert [each.name for each in decision.compared] == ["steady", "inertia"]
+    assert decision.choice != "rest"
     band = found.usual_band()
     assert (np.diff(band) > 0).all()
     assert 0 < band[0] < 0.3 * PIXEL

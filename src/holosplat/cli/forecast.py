@@ -44,7 +44,7 @@ from .progress import ProgressBar
 from .scans import report_run
 from .sentence import interruptible, put, say, tell
 
-FLOWING: tuple[Way, ...] = ("steady", "inertia")
+FLOWING: tuple[Way, ...] = ("rest", "steady", "inertia")
 """Ways of matter that a flow carries."""
 OWN = ("auto", "paths", "rigid", "mechanics", "assimilate", "graph", "hybrid", *FLOWING)
 """Ways of --by; other packages add theirs."""
@@ -68,9 +68,9 @@ class ForecastFlags:
     flow of --channel, which their paths over the last times tell; assimilate: the same, fitted to the frames of these
     times (4D-Var); graph: a network that learnt from red cells in flow; hybrid: the mean of mechanics and the network
     by their errors; dmd, sindy: modes of each body's own past; auto: paths, unless the network, or with a channel the
-    hybrid, tells the last third of the times better. Matter of reconstruct --motion flow goes on by steady, the
-    velocity of each place as at the last time; by inertia, each part with its velocity as far as volumes are kept; or
-    by paths, the fitted change of the flow; auto: whichever tells the last third of the times best."""
+    hybrid, tells the last third of the times better. Matter of reconstruct --motion flow stays by rest; goes on by
+    steady, the velocity of each place as at the last time; by inertia, each part with its velocity as far as volumes
+    are kept; or by paths, the fitted change of the flow; auto: at rest, unless another tells the last third better."""
     weights: str = ""
     """File of the network's weights, as train --network dynamics writes it (default: those of the package)."""
     degree: int = 2

@@ -1,9 +1,10 @@
 """Forecasts of matter in motion: Gaussians that a flow without divergence carries on after the last frames, so that
 each keeps its volume and its amplitude.
 
-A flow goes on in one of three ways. Slow fluid between walls keeps the velocity of each place (`steady`). Where inertia
-rules, fluid keeps its velocity as far as the flow stays free of divergence (`inertia`: Euler's equations by projection;
-Chorin 1968, Math. Comput. 22, 745). Or the fitted change of the flow goes on (`paths`).
+A flow goes on in one of four ways. Matter stays where it is at the last time (`rest`). Slow fluid between walls keeps
+the velocity of each place (`steady`). Where inertia rules, fluid keeps its velocity as far as the flow stays free of
+divergence (`inertia`: Euler's equations by projection; Chorin 1968, Math. Comput. 22, 745). Or the fitted change of the
+flow goes on (`paths`).
 """
 
 from __future__ import annotations
@@ -34,8 +35,8 @@ from .flow_reconstruction import FEWEST_PIXELS, FlowOptions
 from .forecast import early_count
 from .timed_frames import Frames
 
-Way = Literal["steady", "inertia", "paths"]
-STEADY, INERTIA, PATHS = "steady", "inertia", "paths"
+Way = Literal["rest", "steady", "inertia", "paths"]
+REST, STEADY, INERTIA, PATHS = "rest", "steady", "inertia", "paths"
 FEWEST = 4
 """Times of which halves tell a flow."""
 NAME, BY = "how matter goes on", "frames of the last third of the run's times"
@@ -66,12 +67,14 @@ def gone_on(matter: MovingGaussians, last: float, ahead: np.ndarray, way: Way) -
     Its flow begins as it is at `last`; changes are linear from one time to the next. Errors: `InputError` for inertia
     of a flow with sources.
     """
+    require_goes_on(matter, way)
     old, span = matter.flow, float(ahead[-1]) - last
     pace = span / (old.basis.last - old.basis.first)  # velocities are per length of the basis
     cloud = matter.at(last).detached()
     steps = len(ahead) * math.ceil(old.steps * pace / len(ahead))
-    if way == STEADY:
+    if way in (REST, STEADY):
         basis, fields = TimeBasis(last, float(ahead[-1]), 0), [_at(old, last)]
+        pace *= way == STEADY
     else:
         basis = TimeBasis(last, float(ahead[-1]), 1, len(ahead))
         nodes = [last, *ahead.tolist()]
@@ -79,6 +82,19 @@ def gone_on(matter: MovingGaussians, last: float, ahead: np.ndarray, way: Way) -
     tensors = {name: pace * torch.stack([one[name] for one in fields]) for name in fields[0]}
     flow = Flow(tensors["potential"], old.lattice, basis, last, steps, tensors.get("sources"))
     return MovingGaussians(cloud, flow)
+
+
+def require_goes_on(matter: MovingGaussians, way: Way | None) -> None:
+    """`InputError` for matter that fades, and for inertia of a flow with sources."""
+    require(
+        matter.fading is None,
+        "a forecast needs matter that stays as much, but this run's fades, which no frame after it tells; reconstruct "
+        "without --fading.",
+    )
+    require(
+        way != INERTIA or matter.flow.sources is None,
+        "inertia needs a flow without sources, but this one has some; take --by steady.",
+    )
 
 
 def _at(flow: Flow, time: float) -> dict[str, Tensor]:
@@ -103,7 +119,6 @@ def _inertial(flow: Flow, times: list[float]) -> list[dict[str, Tensor]]:
     and projects these velocities onto flows without divergence, by least squares over the lattice. Fluid beyond it is
     at rest.
     """
-    require(flow.sources is None, "inertia needs a flow without sources, but this one has some; take --by steady.")
     constant = TimeBasis(flow.basis.first, flow.basis.last, 0)
     now = replace(flow, basis=constant, potential=_at(flow, times[0])["potential"][None])
     points, found = _between_nodes(flow.lattice).to(flow.potential), [now.potential[0]]
@@ -168,11 +183,7 @@ class FlowHistory:
     def __init__(
         self, matter: MovingGaussians, train: Scan, render: Render, options: FlowOptions = FlowOptions()
     ) -> None:
-        require(
-            matter.fading is None,
-            "a forecast needs matter that stays as much, but this run's fades, which no frame after it tells; "
-            "reconstruct without flow.fading.",
-        )
+        require_goes_on(matter, None)
         self.matter, self.options, self._render = matter, options, render
         light, (material, *_) = LightOptions("even", still="none", noise="white"), matter.matter.channels
         self.frames = Frames.of(Task(train, MaterialPrior.known(material), light=light), material)
@@ -214,7 +225,7 @@ class FlowHistory:
         """Those that matter may go on in, the simplest first."""
         flow = self.matter.flow
         inertia: tuple[Way, ...] = () if flow.sources is not None else (INERTIA,)
-        return (STEADY, *inertia, *((PATHS,) if flow.basis.degree else ()))
+        return (REST, STEADY, *inertia, *((PATHS,) if flow.basis.degree else ()))
 
     def decided(self) -> Decision:
         """Which way tells the frames of the last third of the times best, from flows that never saw them."""

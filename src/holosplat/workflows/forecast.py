@@ -20,7 +20,7 @@ from ..methods.presets import SCHEMA
 from ..metrics import image_scores, intensity_range
 from ..motion.assimilate import carry_by_frames
 from ..motion.dynamics import DynamicsForecast, HybridForecast, window_of
-from ..motion.flow_forecast import PATHS, FlowForecast, FlowHistory, Way, forecast_matter
+from ..motion.flow_forecast import PATHS, FlowForecast, FlowHistory, Way, forecast_matter, require_goes_on
 from ..motion.forecast import SAME_TIME, Forecast, Forecaster, Halves, History, PathForecast, decided
 from ..motion.learned import GraphForecast, read_dynamics
 from ..motion.measures import early_part, half_fit, half_sets
@@ -136,12 +136,13 @@ def require_way(run: Reconstruction, times: np.ndarray, options: ForecastOptions
     carry on after the tracked `times` [T] s, and where what was learnt cannot be asked, or is no network;
     `MissingError` without its library."""
     if isinstance(run.object, MovingGaussians):
-        of_bodies = options.dynamics or (options.learned and not options.decides) or options.model != PathForecast()
+        learned = options.learned is None or (options.decides and options.learned == GraphForecast())
         require(
-            not of_bodies,
-            "--by must be auto, steady, inertia or paths for matter in motion, but it, or an option beside it, is of "
-            "bodies; leave it.",
+            learned and options.dynamics is None and (options.model, options.effort) == (PathForecast(), 1.0),
+            "--by must be auto, rest, steady, inertia or paths for matter in motion, but it, or an option beside it, is "
+            "of bodies; leave it.",
         )
+        require_goes_on(run.object, options.flow)
         return
     tracked_bodies(run)
     require(
