@@ -139,8 +139,8 @@ def require_way(run: Reconstruction, times: np.ndarray, options: ForecastOptions
         learned = options.learned is None or (options.decides and options.learned == GraphForecast())
         require(
             learned and options.dynamics is None and (options.model, options.effort) == (PathForecast(), 1.0),
-            "--by must be auto, rest, steady, inertia or paths for matter in motion, but it, or an option beside it, is "
-            "of bodies; leave it.",
+            "--by must be auto, rest, steady, inertia or paths for matter in motion, but it, or an option beside it, "
+            "is of bodies; leave it.",
         )
         require_goes_on(run.object, options.flow)
         return
