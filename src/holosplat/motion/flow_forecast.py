@@ -43,8 +43,8 @@ NAME, BY = "how matter goes on", "frames of the last third of the run's times"
 PROJECTION, FROM_REST = 20, 40
 """Iterations of a projection, and of a fit from rest: more change neither."""
 
-Render = Callable[[MovingGaussians, Scan], Tensor]
-"""Frames [V, H, W] of matter in motion, as a scan takes them."""
+Render = Callable[[GaussianCloud, Scan], Tensor]
+"""Frames [V, H, W] of matter as it is at the time of a scan, as that takes them."""
 
 
 @dataclass(frozen=True)
@@ -235,7 +235,8 @@ class FlowHistory:
 
         def score(name: str, fold: int) -> Score:
             later = gone_on(self.early(), float(self.early_times[-1]), late, named[name])
-            return Score.joined([Score.of(scan.left(self._render(later, scan).double())) for scan in scans])
+            frames = (self._render(later.at(float(time)), scan) for time, scan in zip(late, scans))
+            return Score.joined([Score.of(scan.left(each.double())) for scan, each in zip(scans, frames)])
 
         return select(NAME, list(named), score, by=BY)
 

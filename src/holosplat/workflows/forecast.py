@@ -27,7 +27,7 @@ from ..motion.measures import early_part, half_fit, half_sets
 from ..optics.background import Light
 from ..progress import FitProgress
 from ..ranges import Many, Positive, Seconds, checked_dataclass
-from ..representations import MovingGaussians, MovingSurfaces
+from ..representations import GaussianCloud, MovingGaussians, MovingSurfaces
 from ..scan import Scan
 from ..tables import read_rows, to_table
 from .evaluate import render_object
@@ -195,7 +195,7 @@ def forecast(
     return Forecasted(found, predicted, _judged(found, run, scan, known, slack), decision)
 
 
-def _rendered(run: Reconstruction, matter: MovingGaussians, scan: Scan) -> torch.Tensor:
+def _rendered(run: Reconstruction, matter: GaussianCloud, scan: Scan) -> torch.Tensor:
     """The frames [V, H, W] of `matter` as `scan` takes them."""
     return torch.from_numpy(render_object(matter, scan.exposures, run.oversample, matter.backend))
 
