@@ -17,7 +17,7 @@ from ..geometry import Grid
 from ..matter import DeltaBeta
 from ..projectors.voxels import projector_for
 from ..ranges import Signed, Weight, checked_dataclass
-from .projected_gradient import direction
+from .projected_gradient import direction, product
 from .whitened import WhitenedFrames
 
 MEMORY = 6
@@ -262,7 +262,7 @@ class Descent:
             return
         moved, value, slope = found
         step, change = moved - u, slope - gradient
-        if float((step * change).sum()) > 0:
+        if product(step, change) > 0:
             self._pairs = [*self._pairs[1 - MEMORY :], (step, change)]
         self.u, self._gradient, self.value = moved, slope, value
         self.done += 1
@@ -276,7 +276,7 @@ class Descent:
             if self.kept and not bool(moved.any()):
                 continue
             found, slope = self.problem(moved)
-            if found <= self.value + SUFFICIENT * min(0.0, float((gradient * (moved - u)).sum())):
+            if found <= self.value + SUFFICIENT * min(0.0, product(gradient, moved - u)):
                 return moved, found, slope
         return None
 

@@ -283,9 +283,7 @@ class SmoothFit:
         unexplained = _unexplained(problem, u)
         if self._grown(problem, u):
             return
-        if leg.kind in ("round", "from even") and bool(u.any()):
-            u = self._mended(problem, u)
-        elif leg.kind == "from coarse" and unexplained > 1:
+        if leg.kind == "from coarse" and unexplained > 1:
             self._rival = (u, descent.value)
         elif leg.kind == "from start" and self._rival is not None:
             other, value = self._rival
@@ -293,7 +291,10 @@ class SmoothFit:
             u, self._rival = (u if clearly * descent.value < value else other), None
         found = self._volume.with_parameters({"values": u[None].cpu()})
         if not self._weakened(found, unexplained, problem):
-            self._volume, self._leg = found, self._leg + 1
+            if leg.kind in ("round", "from even") and bool(self._volume.values.any()):
+                u = self._mended(problem, self._volume.values[0].to(problem.device))
+                self._volume = self._volume.with_parameters({"values": u[None].cpu()})
+            self._leg += 1
 
     def _or_nothing(self, u: Tensor) -> Tensor:
         """u, or an empty volume for one that is next to nothing beside the start."""
@@ -319,21 +320,20 @@ class SmoothFit:
         return unshrunk(problem, u, self.plan.light is not None) if told else modulated(problem, u)
 
     def _weakened(self, found: VoxelGrid, unexplained: float, problem: VolumeProblem) -> bool:
-        """Whether the fit goes elsewhere than on: back to its start with half the prior, or back to a stronger one; not
-        to one that explained next to nothing, as a nearly empty volume does."""
+        """Whether the fit goes back to its start with half the prior. Else it goes on from `found`, or from what a
+        stronger prior found; not from one that explained next to nothing, as a nearly empty volume does."""
+        self._volume = found
         if not bool(found.values.any()):
-            if unexplained <= EMPTY or self._strength <= WEAKEST:
-                return False
-            self._again(self._strength / 2 if self._kept else self._strength)
-            self._kept, self._settled = True, False
-            return True
+            if again := unexplained > EMPTY and self._strength > WEAKEST:
+                self._again(self._strength / 2 if self._kept else self._strength)
+                self._kept, self._settled = True, False
+            return again
         late = self._leg >= len(self._legs) - max(1, self.plan.rounds - 1)  # a first round is often not at its end yet
         if not late or self._settled:
             return False
         if self._stronger is not None and unexplained - 1 > WORTH * (self._stronger[1] - 1):
             (self._volume, _), self._strength, self._settled = self._stronger, 2 * self._strength, True
-            self._leg += 1
-            return True
+            return False
         self._settled = unexplained <= WEAKER or self._strength <= WEAKEST
         if not self._settled:
             empty = _unexplained(problem, torch.zeros_like(found.values[0], device=problem.device))

@@ -45,11 +45,11 @@ class Parts:
         z, y, x = (-(-n // factor) for n in grid.shape)
         coarse = Grid.centred((z, y, x), factor * grid.voxel_size[0], tuple(grid.centre))
         full = found.voxelise(coarse).delta / found.matter.delta > LEVEL
-        around, beyond = _large(~full), np.zeros(0, dtype=int)
+        around = _large(~full)
+        inside = np.ones(int(around.max(initial=0)) + 1, dtype=bool)
         for axis in range(3):
-            beyond = np.union1d(beyond, [np.take(around, (0, -1), axis)])
-        bodies = _large(full | (around == 0))
-        return cls(bodies, _renumbered(np.where(np.isin(around, beyond), 0, around)), coarse)
+            inside[np.take(around, (0, -1), axis)] = False
+        return cls(_large(full | (around == 0)), _renumbered(around, inside), coarse)
 
     def write(self, path: Path) -> None:
         """Write them, whole or not at all."""
@@ -155,14 +155,13 @@ def _large(mask: np.ndarray) -> np.ndarray:
     """Numbers of the connected parts of at least `LEAST_VOLUME` voxels."""
     found = np.empty(mask.shape, dtype=np.int32)
     ndimage.label(mask, output=found)  # pyright: ignore[reportArgumentType] (as in `bodies.rest_shape`)
-    small = np.bincount(found.ravel()) < LEAST_VOLUME
-    return _renumbered(np.where(small[found], 0, found))
+    return _renumbered(found, np.bincount(found.ravel()) >= LEAST_VOLUME)
 
 
-def _renumbered(labels: np.ndarray) -> np.ndarray:
-    """Numbers from 1 on without gaps, uint16."""
-    kept = np.unique(labels[labels > 0])
-    return np.searchsorted(kept, labels, side="left").astype(np.uint16) + np.uint16(1) * (labels > 0)
+def _renumbered(labels: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """Numbers, uint16, from 1 on without gaps, of those labels above 0 that are `kept` [labels]; 0 of others."""
+    kept = kept & (np.arange(len(kept)) > 0)
+    return (np.cumsum(kept) * kept).astype(np.uint16)[labels]
 
 
 def _measures(labels: np.ndarray, grid: Grid) -> tuple[np.ndarray, np.ndarray]:

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from ..backends import resolve
+from ..baselines.tomography import plateau
 from ..checks import as_written, require
 from ..fit.residuals import Prediction
 from ..geometry import Grid, Views
@@ -308,13 +309,14 @@ def material_found(found: Stored, kind: MatterKind = "levels") -> MaterialFound:
     if matter.occupancies and not (matter.single and kind == "continuous"):
         return MaterialFound(matter.delta, matter.channels[0].ratio, matter.single, matter.others)
     volume = found.voxelise(found.enclosing_grid(MOST_VOXELS))
-    delta, beta = (values.ravel().astype(np.float64) for values in (volume.delta, volume.beta))
-    size, beta = np.abs(delta), np.sign(delta) * beta
-    level = _weighted_median(size, size)
-    dense = size >= 0.5 * level
-    ratio = _weighted_median(size[dense] / np.maximum(beta[dense], 1e-30), size[dense])
-    side = math.copysign(1.0, delta.sum())
-    return MaterialFound(side * level, matter.channels[0].ratio if matter.single else ratio, matter.single)
+    size = np.abs(volume.delta)
+    level = plateau(torch.from_numpy(size)) if size.any() else 0.0
+    level = math.copysign(level, volume.delta.sum(dtype=np.float64))
+    if matter.single:
+        return MaterialFound(level, matter.channels[0].ratio, True)
+    dense = size >= 0.5 * abs(level)
+    ratio = size[dense] / np.maximum((np.sign(volume.delta) * volume.beta)[dense], 1e-30)
+    return MaterialFound(level, _weighted_median(ratio, size[dense].astype(np.float64)), False)
 
 
 def _as_text(delta: float, beta: float) -> str:

@@ -84,8 +84,8 @@ def total_of_run(said: Prediction, frames: Scan, task: Task, constants: tuple[De
     found = cast(Stored, said.object)
     quantity: Literal["δ", "β"] = "δ" if task.delta_told else "β"
     grid = Grid.of_views(frames[[0]].binned(binning(frames, MOST_VOXELS)).views)
-    delta = np.asarray(found.voxelise(grid).delta, dtype=np.float64)
-    held = float(delta.sum()) * math.prod(grid.voxel_size)
+    volume = found.voxelise(grid)
+    held = float(np.sum(volume.delta, dtype=np.float64)) * math.prod(grid.voxel_size)
     sign, against = found.matter.channels[0].sign, task.prior.against
     if task.prior.spherical and isinstance(found, VoxelGrid) and bool(found.values.any()):
         fit = SmoothStage(SmoothVolume()).fit(task, found)
@@ -109,7 +109,7 @@ def total_of_run(said: Prediction, frames: Scan, task: Task, constants: tuple[De
     ].binned(factor)
     shown = None if predicted is None else torch.from_numpy(predicted.frames)
     doubt = ratio_doubt(task.prior, constants)
-    total = total_delta(found, few.binned(factor), noise, shown, doubt)
+    total = total_delta(found, few.binned(factor), noise, shown, doubt, volume)
     material = task.prior.materials[0].delta if len(task.prior.materials) == 1 else None
     return TotalMatter(
         quantity,
