@@ -12,7 +12,7 @@ from holosplat.fit.smooth_volume import ContinuousPrior, Descent
 from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import Task
-from holosplat.motion.timed_frames import Frames, iterations_that_predict, kept_frames
+from holosplat.motion.timed_frames import Frames, iterations_that_predict, kept_frames, others
 from holosplat.representations import Flow, Lattice, TimeBasis
 from holosplat.scan import Exposures
 from holosplat.specimens.continuous import Bump, ContinuousScene, ellipsoid
@@ -23,13 +23,13 @@ LEFT = np.array([[False, True, False, False], [False, False, False, True]])
 
 
 def test_a_share_of_the_frames_is_held_out_and_one_a_time_is_kept():
-    keep = kept_frames(7, 3, 4, 1)
-    assert keep.shape == (7, 3)
-    assert (~keep).sum() == 5
-    assert np.array_equal(keep, kept_frames(7, 3, 4, 1))
-    assert not np.array_equal(keep, kept_frames(7, 3, 4, 2))
-    lonely = kept_frames(9, 1, 2, 0)
-    assert lonely.all()
+    counts = [3, 3, 2, 3, 3, 3, 4]
+    keep = kept_frames(counts, 4, 1)
+    assert [len(each) for each in keep] == counts
+    assert sum(int(each.sum()) for each in others(keep)) == 5
+    assert all(np.array_equal(*each) for each in zip(keep, kept_frames(counts, 4, 1)))
+    assert not all(np.array_equal(*each) for each in zip(keep, kept_frames(counts, 4, 2)))
+    assert all(each.all() for each in kept_frames([1] * 9, 2, 0))
 
 
 def problems(photons: float) -> tuple[FlowProblem, FlowProblem, torch.Tensor]:

@@ -115,8 +115,10 @@ def test_where_one_time_shows_nothing_all_of_them_begin(drifting, monkeypatch):
 
 
 def test_a_drift_is_said_to_move(drifting):
-    how = search(drifting[1])
-    assert how.moves(how.by_itself(merged(drifting[1]), "mean"))
+    """Though a frame of one time is missing."""
+    part = drifting[1][np.delete(np.arange(12), 4)]
+    how = search(part)
+    assert how.moves(how.by_itself(merged(part), "mean"))
 
 
 def test_what_stands_still_is_not_said_to_move():
@@ -131,7 +133,10 @@ def test_merged_frames_are_means_of_the_times(drifting):
     mean = merged(scan)
     assert len(mean) == 3
     assert mean.frames == pytest.approx(scan.frames.reshape(4, 3, 19, 23).mean(0), rel=1e-6)
-    assert len(merged(scan[np.arange(11)])) == 11
+    part = merged(scan[np.arange(11)])
+    assert len(part) == 3
+    np.testing.assert_array_equal(part.frames[:2], mean.frames[:2])
+    assert part.frames[2] == pytest.approx(scan.frames[[2, 5, 8]].mean(0), rel=1e-6)
 
 
 def test_freer_flows_begin_as_the_ones_before():

@@ -14,7 +14,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -43,7 +42,17 @@ from ..representations import (
 )
 from ..representations.initialise import FILLED
 from ..scan import Scan
-from .timed_frames import Change, Frames, freer_flows, iterations_that_predict, kept_frames, likelihood_ratio, merged
+from .timed_frames import (
+    Change,
+    Frames,
+    Masks,
+    freer_flows,
+    iterations_that_predict,
+    kept_frames,
+    likelihood_ratio,
+    merged,
+    others,
+)
 
 MOTION, STILL, FLOW = "motion", "matter at rest", "steady flow"
 FREEDOM, BY = "freedom of the flow", "frames set aside"
@@ -191,7 +200,7 @@ class FlowSearch:
                 self.task.on_progress("does it move", fold / self.options.held_out)
                 keep = self._training_mask(fold)
                 moving = self._update_flow(self._problem_of_all(state, keep), state)
-                left.append((self.left_out(state, ~keep), self.left_out(moving, ~keep)))
+                left.append((self.left_out(state, others(keep)), self.left_out(moving, others(keep))))
             found = likelihood_ratio(FLOW, *(torch.cat(frames) for frames in zip(*left)))
         self._decide(MOTION, STILL, found, began)
         return found.wins
@@ -207,9 +216,9 @@ class FlowSearch:
         return _State(flow, u, Fading.none(flow.lattice) if self.options.fading > 0 else None)
 
     def problem(
-        self, which: Sequence[int] | range, factor: int, state: _State, keep: np.ndarray | None = None
+        self, which: Sequence[int] | range, factor: int, state: _State, keep: Masks | None = None
     ) -> FlowProblem:
-        """The frames of the times numbered `which`; keep: [T, V] bool, of these frames."""
+        """The frames of the times numbered `which`; keep: of these frames."""
         frames = [self.frames.whitened(k, factor, None if keep is None else keep[k]) for k in which]
         prior = self.prior if factor == 1 else self.prior.on_larger_voxels(factor)
         times = self.times[list(which)].tolist()
@@ -217,8 +226,8 @@ class FlowSearch:
         problem.fade(state.fading, state.flow)
         return problem
 
-    def _problem_of_all(self, state: _State, keep: np.ndarray | None = None) -> FlowProblem:
-        """The frames of all times, or those that `keep` [T, V] says."""
+    def _problem_of_all(self, state: _State, keep: Masks | None = None) -> FlowProblem:
+        """The frames of all times, or those that `keep` says."""
         return self.problem(range(len(self.times)), self.factor, state, keep)
 
     def on(self, volume: VoxelGrid, factor: int) -> Tensor:
@@ -297,27 +306,27 @@ class FlowSearch:
             state = self._step("flow", lambda s=state, c=change: self._try_freer_flow(s, c, keep))
         return self._step("flow", lambda: self.turns(self._problem_of_all(state), state))
 
-    def _training_mask(self, fold: int = 0) -> np.ndarray:
-        """[T, V] bool: the frames that are not held out."""
-        return kept_frames(len(self.times), len(self.frames.scans[0]), self.options.held_out, self.task.seed, fold)
+    def _training_mask(self, fold: int = 0) -> Masks:
+        """The frames that are not held out."""
+        return kept_frames([len(one) for one in self.frames.scans], self.options.held_out, self.task.seed, fold)
 
-    def _try_freer_flow(self, state: _State, change: Change, keep: np.ndarray) -> _State:
-        """The state with a freer flow, if that predicts the frames better that `keep` [T, V] leaves out."""
+    def _try_freer_flow(self, state: _State, change: Change, keep: Masks) -> _State:
+        """The state with a freer flow, if that predicts the frames better that `keep` leaves out."""
         wanted = change(state.flow)
         if wanted is None:
             return state
-        began, kept = clock.perf_counter(), self._problem_of_all(state, keep)
+        began, kept, aside = clock.perf_counter(), self._problem_of_all(state, keep), others(keep)
         same = self.turns(kept, state)
         kept.carry(wanted)
         kept.fade(state.fading, wanted)
         other = self.turns(kept, replace(state, flow=wanted))
-        found = likelihood_ratio(_size(wanted), self.left_out(same, ~keep), self.left_out(other, ~keep))
+        found = likelihood_ratio(_size(wanted), self.left_out(same, aside), self.left_out(other, aside))
         self._decide(FREEDOM, _size(state.flow), found, began)
         return other if found.wins else state
 
-    def left_out(self, state: _State, left: np.ndarray) -> Tensor:
-        """[F, H, W] what `state` leaves of the frames `left` [T, V] bool, over their noise."""
-        times = np.flatnonzero(left.any(1)).tolist()
+    def left_out(self, state: _State, left: Masks) -> Tensor:
+        """[F, H, W] what `state` leaves of the frames `left`, over their noise."""
+        times = [k for k, each in enumerate(left) if each.any()]
         return self.problem(times, self.factor, state, left).residuals(state.u)
 
     def finished(self, state: _State) -> FlowResult:
@@ -354,12 +363,13 @@ class FlowSearch:
         """Iterations of the volume on voxels of a pixel: as many as predict frames best that are held out, which the
         volume that they begin with is made to forget."""
         keep, how = self._training_mask(), self.options
-        left = [int(k) for k in np.flatnonzero((~keep).any(1))]
+        out = others(keep)
+        left = [k for k, each in enumerate(out) if each.any()]
         if not left or how.most_final <= how.final:
             return how.final
         large = self._problem_of_all(state, keep)
         state = self._finer(replace(state, u=descend(large, state.u, how.iterations)[0]))
-        kept, aside = self.problem(range(len(keep)), 1, state, keep), self.problem(left, 1, state, ~keep)
+        kept, aside = self.problem(range(len(keep)), 1, state, keep), self.problem(left, 1, state, out)
         best, gain = iterations_that_predict(kept, aside, state.u, how.most_final)
         wanted = max(best, how.final)
         self.history.append(

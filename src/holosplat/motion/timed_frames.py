@@ -47,31 +47,36 @@ class Frames:
 
 
 def merged(scan: Scan) -> Scan:
-    """The mean of the frames of each exposure over the times, as a scan of one time, where all times have the same
-    exposures; else all frames, as if taken at one time."""
-    count, times = len(scan), scan.instants
-    each = [np.flatnonzero(scan.exposures.time == time) for time in times]
-    first = scan.exposures[each[0]]
-    same = all(
-        len(one) == len(each[0]) and scan.views[one].fingerprint() == first.views.fingerprint() for one in each[1:]
-    )
-    if not same or len(each[0]) * len(times) != count:
+    """The mean of the frames of each pose over the times, as a scan of one time."""
+    same = dict[bytes, list[int]]()
+    for k in range(len(scan)):
+        same.setdefault(scan.views[[k]].fingerprint(), []).append(k)
+    if len(same) == len(scan):
         return scan.as_static()
-    frames = np.mean([scan.frames[one] for one in each], axis=0)
-    return replace(scan[each[0]], frames=frames).as_static()
+    frames = np.stack([scan.frames[each].mean(axis=0) for each in same.values()])
+    return replace(scan[[each[0] for each in same.values()]], frames=frames).as_static()
 
 
+Masks = list[np.ndarray]
+"""Of each time, which of its frames: [V] bool."""
 WINDOW, PATIENCE = 10, 3
 """Iterations from one look at held-out frames to the next, and looks without a better one after which the fit ends."""
 
 
-def kept_frames(times: int, views: int, held_out: int, seed: int, fold: int = 0) -> np.ndarray:
-    """[T, V] bool: all frames but one in `held_out`, drawn at random, others in each `fold`; one a time at least."""
-    aside, count = np.zeros(times * views, dtype=bool), times * views // held_out
-    aside[np.random.default_rng(seed).permutation(times * views)[fold * count : (fold + 1) * count]] = True
-    keep = ~aside.reshape(times, views)
-    keep[~keep.any(1), 0] = True
-    return keep
+def kept_frames(counts: Sequence[int], held_out: int, seed: int, fold: int = 0) -> Masks:
+    """Of each of the times, which have `counts` of frames, all frames but one in `held_out`, drawn at random, others in
+    each `fold`; one a time at least."""
+    keep, together = np.ones(sum(counts), dtype=bool), sum(counts) // held_out
+    keep[np.random.default_rng(seed).permutation(len(keep))[fold * together : (fold + 1) * together]] = False
+    found = np.split(keep, np.cumsum(counts)[:-1])
+    for each in found:
+        each[0] |= not each.any()
+    return found
+
+
+def others(keep: Masks) -> Masks:
+    """The frames that `keep` leaves out."""
+    return [~each for each in keep]
 
 
 def iterations_that_predict(kept: FlowProblem, aside: FlowProblem, u: Tensor, most: int) -> tuple[int, float]:
