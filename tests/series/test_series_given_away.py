@@ -52,10 +52,10 @@ def test_a_finished_export_of_a_series_is_not_done_again(mine, tmp_path):
         assert "[export] is done" in worked(holosplat("run", "run.toml")).err
 
 
-def test_windows_of_track_are_exported_task_by_task(files, tmp_path):
+def test_a_run_of_a_window_is_named(files, tmp_path):
     folder = planned(tmp_path / "series", files.scan, 3, Settings("track"))
-    run = folder.task(0) / "run"
-    assert facts_of_series(folder.path).commands[1] == f"holosplat export {run} --volume v.h5 --time-frame all"
+    run = folder.whole(0)
+    assert facts_of_series(folder.path).commands[1] == f"holosplat export {folder.path} --volume v.h5 --time-frame all"
     with pytest.raises(InputError, match="whose run folders are in tasks/, but none has begun"):
         RunFolder(folder.path).require_run()
     run.mkdir(parents=True)

@@ -183,11 +183,12 @@ def test_durations():
 def test_bad_input_of_the_command(files, done, tmp_path):
     refused(holosplat("series", "plan", files.scan, "--out", done.path), "must be new or empty", "--force")
     refused(
-        holosplat("series", "plan", files.scan, "--out", tmp_path / "a", "--rounds", 2), "--rounds goes with --track"
+        holosplat("series", "plan", files.scan, "--out", tmp_path / "a", "--rounds", 2),
+        "--rounds does not go with --motion each",
     )
     refused(
         holosplat("series", "plan", files.scan, "--track", "--preset", "fast", "--out", tmp_path / "a"),
-        "--preset is of",
+        "--preset does not go with --motion bodies",
     )
     refused(holosplat("series", "plan", files.scan, "--delta-beta", "1:2", "--out", tmp_path / "a"), "one number")
     refused(holosplat("series", "run", tmp_path), "must hold a series")

@@ -90,7 +90,7 @@ def test_what_a_series_cannot_be(files):
     for reading, settings, said in (
         (Reading(part=Part(time_frame=1)), SETTINGS, "takes all times"),
         (Reading(part=Part(time_frames="0:2")), Settings("track"), "leave --time-frames"),
-        (Reading(part=Part(views="0:4")), Settings("track"), "bodies are followed through several times"),
+        (Reading(part=Part(views="0:4")), Settings("track"), "motion is found in 3 times or more"),
     ):
         with pytest.raises(InputError, match=said):
             plan_series([files.scan], settings, known, reading, Cut())

@@ -184,7 +184,7 @@ def reconstruct(
 def _with_motion(scan: Path, out: Path, asked: Asked, reading: Reading, seed: int, resume: bool) -> Asked:
     """What is asked, with the motion that frames choose, or have chosen for what is begun in `out`."""
     from ..io.formats import read_frames
-    from ..workflows.motion_choice import MOTION, begun_motion, choose_motion, motion_of
+    from ..workflows.motion_choice import MOTION, begun_motion, choose_motion, motion_named
 
     settings = asked.each_time(asked.how.chosen(), reading, seed)
     decision = begun_motion(out) if resume else None
@@ -201,7 +201,7 @@ def _with_motion(scan: Path, out: Path, asked: Asked, reading: Reading, seed: in
         if command := command_now():
             command.decided[MOTION] = decision.as_dict()
     say(decision.line)
-    return replace(asked, motion=replace(asked.motion, motion=motion_of(decision)))
+    return replace(asked, motion=replace(asked.motion, motion=motion_named(decision.choice)))
 
 
 def _time_by_time(scan: Path, out: Path, asked: Asked, reading: Reading, seed: int, resume: bool) -> None:

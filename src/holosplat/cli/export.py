@@ -50,13 +50,26 @@ Sampling = tuple[tuple[int, int, int] | None, float | None]
 @dataclass(frozen=True)
 class Moment:
     """A run at one time [s]. frame: its number, which file names add, or None; bodies: closed meshes [m], if it has
-    them; folder: of the run."""
+    them; folder: of the run; own: the number of the time in the run, None where this is of one time."""
 
     frame: int | None
     time: float
     result: Reconstruction
     bodies: list[TriangleMesh] | None
     folder: RunFolder
+    own: int | None = None
+
+    @classmethod
+    def of(cls, frame: int | None, time: float, result: Reconstruction, folder: RunFolder) -> Moment:
+        """Of a run, at the nearest of its times where its matter moves."""
+        found, own, times = result.object, None, instants_of(folder)
+        if isinstance(found, InMotion):
+            own = int(np.argmin(np.abs(np.array(times) - time)))
+            bodies = found.bodies(times[own]) if isinstance(found, MovingSurfaces) else None
+            result = reconstruction_at(result, times, own)
+        else:
+            bodies = found.bodies() if isinstance(found, SurfaceMesh) else None
+        return cls(frame, time, result, bodies, folder, own)
 
 
 def write_files(
@@ -93,7 +106,7 @@ def write_files(
             if path is bodies:
                 _export_bodies(one, out)
             elif path is volume:
-                grid = _export_volume(one, out, sampling, None if single else one.frame)
+                grid = _export_volume(one, out, sampling)
             else:
                 found = one.result.object
                 if not isinstance(found, GaussianCloud):
@@ -197,7 +210,7 @@ def _exposures_of(folder: RunFolder, volume: Path, frame: int | None) -> Exposur
     return scan.exposures[np.flatnonzero(~scan.is_test)]
 
 
-def _export_volume(one: Moment, volume: Path, sampling: Sampling, frame: int | None) -> Grid:
+def _export_volume(one: Moment, volume: Path, sampling: Sampling) -> Grid:
     (shape, voxel_size), folder = sampling, one.folder
     with as_written(folder.summary, "what reconstruct wrote"):
         detector = read_json(folder.summary)["detector"]
@@ -210,7 +223,7 @@ def _export_volume(one: Moment, volume: Path, sampling: Sampling, frame: int | N
     require(count <= MOST_VOXELS, f"shape must have at most {MOST_VOXELS:.0e} voxels, but it has {count:.0e}.")
     slabs = ((f"an HDF5 file{how}", of_export(shape, ".h5")) for how, shape in _smaller(grid.shape))
     tell("the volume", of_export(grid.shape, volume.suffix.lower()), volume, slabs)
-    export(one.result, volume, grid, exposures=_exposures_of(folder, volume, frame), matter=matter_of(folder))
+    export(one.result, volume, grid, exposures=_exposures_of(folder, volume, one.own), matter=matter_of(folder))
     say(f"wrote {volume}: {' × '.join(map(str, grid.shape))} voxels of {1e6 * grid.voxel_size[0]:.4g} µm")
     return grid
 
@@ -225,7 +238,7 @@ def _smaller(shape: tuple[int, int, int]) -> Iterator[tuple[str, tuple[int, int,
 
 
 def moments_of(folder: RunFolder, time_frame: int | Literal["all"] | None) -> Iterator[Moment]:
-    """A run, or a series of single times, at the time `time_frame` (counted from 0, default: the first) or "all" of
+    """A run, or a series, at the time `time_frame` (counted from 0, default: the first) or "all" of
     them. Errors: `InputError`, before the first, for times that are missing or not done, and for any of a run of one
     time."""
     runs = runs_of(folder.path)
@@ -238,17 +251,13 @@ def moments_of(folder: RunFolder, time_frame: int | Literal["all"] | None) -> It
         )
     for k in chosen:
         time, run = runs[k]
-        result = load_reconstruction(run)
-        bodies = result.object.bodies() if isinstance(result.object, SurfaceMesh) else None
-        yield Moment(k if time_frame == "all" else None, time, result, bodies, run)
+        yield Moment.of(k if time_frame == "all" else None, time, load_reconstruction(run), run)
     if runs:
         return
     result, times = load_reconstruction(folder), instants_of(folder)
-    found = result.object
-    if not isinstance(found, InMotion):
+    if not isinstance(result.object, InMotion):
         require(time_frame is None, f"{folder.path} is of one time; leave --time-frame.")
-        yield Moment(None, 0.0, result, found.bodies() if isinstance(found, SurfaceMesh) else None, folder)
+        yield Moment.of(None, 0.0, result, folder)
         return
     for k in chosen_frames(time_frame, times):
-        bodies = found.bodies(times[k]) if isinstance(found, MovingSurfaces) else None
-        yield Moment(k if time_frame == "all" else None, times[k], reconstruction_at(result, times, k), bodies, folder)
+        yield Moment.of(k if time_frame == "all" else None, times[k], result, folder)

@@ -59,7 +59,7 @@ ESSENTIAL: dict[str, tuple[str, ...]] = {
     "info": ("picture", *READ, "flats", "darks"),
     "convert": (*MATTER, *READ, "test_views"),
     "train": ("steps", "network", "volume", "seed", "resume"),
-    "series plan": ("window", "overlap", *MATTER, *METHOD, "seed", "track", *READ),
+    "series plan": ("motion", "window", "overlap", *MATTER, *METHOD, "seed", *READ),
 }
 """Command → what `--help` shows of it, beside required options and --force; of other commands it shows everything."""
 

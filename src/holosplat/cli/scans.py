@@ -72,13 +72,11 @@ def run_and_scan(folder: RunFolder, scan: Path | None, reading: Reading) -> tupl
 
 
 def runs_of(path: Path) -> list[tuple[float, RunFolder]]:
-    """The times [s] of a series of single times, and their run folders; nothing for what is no such series."""
+    """The times [s] of a series, and their run folders; nothing for what is no series."""
     series = SeriesFolder(path)
-    plan = series.plan() if series.file.is_file() else None
-    if plan is None or plan.settings.act == "track":
-        return []
-    each = [(window.number, moment) for window in plan.windows() for moment in window.own]
-    return [(moment.time, RunFolder(series.run(task, moment.number))) for task, moment in each]
+    windows = series.plan().windows() if series.file.is_file() else ()
+    each = [(window.number, moment) for window in windows for moment in window.own]
+    return [(moment.time, RunFolder(series.run_of(task, moment.number))) for task, moment in each]
 
 
 def report_run(
@@ -197,8 +195,8 @@ def side_of_run(path: Path) -> Side:
 
 def rehearse_each(run: Path, times: int, bins: int | None, reading: Reading) -> None:
     """Rehearse a run, or every time that is done of a series, whose table is then written again."""
-    each = runs_of(run)
-    for number, (_, folder) in enumerate(each):
+    each = {folder.path: (number, folder) for number, (_, folder) in reversed(list(enumerate(runs_of(run))))}
+    for number, folder in sorted(each.values(), key=lambda one: one[0]):
         if folder.result().is_file():
             say(f"time {number}:")
             _rehearse(folder, times, bins, reading)

@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg, subcommand
 
@@ -19,7 +19,7 @@ from ..planning.scan_facts import smaller
 from ..ranges import Jobs, Seed, checked_dataclass
 from ..series.collect import collect as join
 from ..series.folder import Row, SeriesFolder, line_of, table_of, time_left, verdict_of
-from ..series.plan import Cut, Settings, Slurm, Warm, listed, plan_series
+from ..series.plan import ACTS, Cut, Settings, Slurm, Warm, listed, plan_series
 from ..series.run import Counts, counted, run_left, run_on_dask, run_processes, states, submit, write_script
 from ..series.stream import RECEIVED, SCHEME, Stream, Streaming
 from ..series.task import run_task
@@ -33,6 +33,7 @@ from .places import Kept, Output, with_checked_arguments
 from .sentence import interruptible, put, say, tell
 from .track import BodyFlags, MotionFlags
 
+AskedMotion = Literal["each", "still", "flow", "bodies", "auto"]
 UNFINISHED = 4
 """Exit code of `series run` and `collect` where tasks failed or are left."""
 
@@ -58,16 +59,16 @@ class Act:
     known: BodyFlags = field(default_factory=BodyFlags)
     illumination: RunLightFlags = field(default_factory=RunLightFlags)
 
-    def settings(self, track: bool, seed: int) -> Settings:
-        """The settings of each task; `InputError` for options of the other act."""
-        stray = _changed(self.motion, self.known) if not track else _changed(self.how)
-        other = "goes with --track" if not track else "is of reconstruct; leave it, or --track"
-        require(not stray, f"--{stray[0].replace('_', '-') if stray else ''} {other}.")
+    def settings(self, motion: AskedMotion, seed: int) -> Settings:
+        """The settings of each task; `InputError` for options of another motion."""
+        stray = [] if motion in ("bodies", "auto") else _changed(self.motion, self.known)
+        stray += _changed(self.how) if motion in ("bodies", "flow") else []
+        name = stray[0].replace("_", "-") if stray else ""
+        require(not stray, f"--{name} does not go with --motion {motion}; leave one of them.")
         shared = {"light": self.illumination.options(), "seed": seed, "reports": self.each.reports}
-        if track:
-            return Settings("track", motion=replace(self.motion.options(), body=self.known.known()), **shared)
-        warm = Warm(self.each.warm)
-        return Settings("reconstruct", self.how.chosen(), self.how.kind_of_matter(), warm, **shared)
+        bodies = replace(self.motion.options(), body=self.known.known())
+        how = {"method": self.how.chosen(), "matter": self.how.kind_of_matter(), "warm": Warm(self.each.warm)}
+        return Settings(ACTS[motion], motion=bodies, **how, **shared)
 
 
 def _changed(*groups: object) -> list[str]:
@@ -104,6 +105,7 @@ def plan(
     reading: Reading = Reading(),
     *,
     seed: Seed = 0,
+    motion: AskedMotion = "each",
     track: bool = False,
 ) -> None:
     """Cut a series into tasks, in a new folder; nothing is reconstructed yet.
@@ -113,10 +115,15 @@ def plan(
             scan files, whose order is that of their names.
         out: Folder of the series to make.
         seed: Seed of everything random.
-        track: Follow closed bodies through all times of a task, as holosplat track does; else each is reconstructed.
+        motion: What is made of the times of a task, as by --motion of reconstruct. each: a run for each; still: one
+            object for all; flow: one that a flow carries; bodies: closed bodies, as track; auto: by times set aside.
+        track: Short for --motion bodies.
     """
     require(not matter.ranges(), "a series needs one number for --delta-beta; find it by reconstruct of one time.")
-    settings = act.settings(track, seed)
+    require(
+        not track or motion in ("each", "bodies"), f"--track is --motion bodies, but --motion is {motion}; leave one."
+    )
+    settings = act.settings("bodies" if track else motion, seed)
     folder = SeriesFolder(out)
     found = plan_series(listed(scans), settings, matter.prior, reading, windows)
     folder.create(found)
@@ -290,7 +297,7 @@ def watch(
     """
     require(not matter.ranges(), "a watch needs one number for --delta-beta; find it by reconstruct of one scan.")
     require(reading.part.time_frame is None, "a watch takes all times of a scan; choose some with --time-frames.")
-    settings = Act(each, method, illumination=illumination).settings(track=False, seed=seed)
+    settings = Act(each, method, illumination=illumination).settings("each", seed)
     address = re.sub("^tcp:/+", SCHEME, str(folder))  # pathlib makes one slash of two
     from_socket, result = address.startswith(SCHEME), WatchFolder(out)
     source = result.path / RECEIVED if from_socket else folder

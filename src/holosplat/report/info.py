@@ -89,7 +89,6 @@ def facts_of_series(path: Path) -> Facts:
 
     with as_written(path / SERIES, "the plan of a series"):
         plan = read_json(path / SERIES)
-        tracked = plan["settings"]["act"] == "track"
         scans = [(str(one["path"]), len(one["times_s"])) for one in plan["scans"]]
     with as_written(path, "rows of a series"):
         files = sorted(path.glob("tasks/*/*.row.json"), reverse=True)  # of a time of two tasks, the first one's row
@@ -101,8 +100,7 @@ def facts_of_series(path: Path) -> Facts:
     said |= {"state": f"{len(done)} of {count} times are done"}
     said |= {"verdict": "; ".join(line.strip().rstrip(".") for line in said_of_times(judged, count))} if judged else {}
     said |= {"chosen": chosen.line} if chosen else {}
-    run = path / "tasks" / "0000" / "run" if tracked else path
-    commands = (f"holosplat series collect {path}", f"holosplat export {run} --volume v.h5 --time-frame all")
+    commands = (f"holosplat series collect {path}", f"holosplat export {path} --volume v.h5 --time-frame all")
     return Facts(said, (), commands)
 
 

@@ -75,10 +75,7 @@ def collected(folder: SeriesFolder) -> Collected:
         early[window.number] = {m.number: rows[m.number] for m in window.moments[: window.early] if m.number in rows}
         for moment in window.own:
             task_of[moment.number] = window.number
-            tracked = plan.settings.act == "track"
-            run_of[moment.number] = (
-                folder.task(window.number) / "run" if tracked else folder.run(window.number, moment.number)
-            )
+            run_of[moment.number] = folder.run_of(window.number, moment.number)
             if moment.number in rows:
                 found[moment.number] = rows[moment.number]
     moments = tuple(plan.moments())
@@ -231,8 +228,8 @@ def page_of(folder: SeriesFolder, found: Collected) -> SeriesPage:
     frames = []
     for moment, row, run, names in zip(found.moments, found.rows, found.runs, found.bodies):
         if row is not None and row.done:
-            tracked = found.plan.settings.act == "track"
-            phase = run / (f"t{moment.number:04d}.{PHASE}" if tracked else PHASE)
+            shared = run / f"t{moment.number:04d}.{PHASE}"
+            phase = shared if shared.is_file() else run / PHASE
             frames.append(Frame(row, moment.time, phase, run.relative_to(folder.path).as_posix(), names))
     failed = {f"task {s.number}": plain(s.reason) for s in found.states if s.state == "failed"}
     missing = len(found.missing)

@@ -172,6 +172,15 @@ class SeriesFolder:
         """The run folder of a time of a task."""
         return self.task(task) / f"t{moment:04d}"
 
+    def whole(self, task: int) -> Path:
+        """The run folder of all times of a task together, where these are not taken by themselves."""
+        return self.task(task) / "run"
+
+    def run_of(self, task: int, moment: int) -> Path:
+        """The run folder that has a time of a task, its own or that of all."""
+        whole = self.whole(task)
+        return whole if whole.is_dir() else self.run(task, moment)
+
     def row(self, task: int, moment: int) -> Path:
         """The file of a time's row."""
         return self.task(task) / f"t{moment:04d}.{ROW}"

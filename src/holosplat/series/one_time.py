@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -37,6 +38,7 @@ from ..workflows.preconditions import decided_before
 from ..workflows.reconstruct import load_reconstruction, reconstruct
 from ..workflows.reconstruction import Reconstruction
 from ..workflows.run_folder import RunFolder, claimed
+from ..workflows.totals import TotalMatter
 from .events import PARTS, Parts
 from .folder import Body, Row
 from .plan import Settings, at, prior_of, times_of
@@ -339,13 +341,17 @@ def filled(row: Row, done: Reconstruction, evaluation: Evaluation) -> Row:
     """`row` with what a finished reconstruction says."""
     scores = {"test": evaluation.test, "train": evaluation.train}
     means = {name: {} if one is None else one.as_dict()["mean"] for name, one in scores.items()}
-    total = done.total
-    told = {} if total is None else {"quantity": total.quantity, "total": total.value, "total_error": total.error}
+    told = {} if done.total is None else told_of(done.total)
     verdict = done.verdict
     said = {} if verdict is None else {"good": verdict.good, "words": verdict.words}
     bodies = bodies_of(done.object)
     found = {"kind": done.object.kind, "size": done.object.described, "unexplained": _share(done), "bodies": bodies}
     return replace(row, status="done", **found, **means, **told, **said)
+
+
+def told_of(total: TotalMatter) -> dict[str, Any]:
+    """A total, as rows have it."""
+    return {"quantity": total.quantity, "total": total.value, "total_error": total.error}
 
 
 def bodies_of(found: Stored) -> tuple[Body, ...]:

@@ -81,10 +81,10 @@ class SeriesPlan:
         return [Moment(n, *pair) for n, pair in enumerate(pairs)]
 
     def windows(self) -> list[Window]:
-        """The tasks. Bodies are followed within one scan, so windows of `track` end with it."""
+        """The tasks. What is found in several times is of one scan, so windows end with it."""
         moments, found = self.moments(), list[Window]()
         parts = [moments]
-        if self.settings.act == "track":
+        if self.settings.act != "reconstruct":
             parts = [[m for m in moments if m.source == s] for s in range(len(self.sources))]
         for part in parts:
             for first in range(0, len(part), self.cut.window):
@@ -150,8 +150,8 @@ def plan_series(
     """
     require(reading.part.time_frame is None, "a series takes all times; choose some with --time-frames.")
     require(
-        settings.act != "track" or reading.part.time_frames is None,
-        "windows of --track go through all times of a scan; leave --time-frames.",
+        settings.act == "reconstruct" or reading.part.time_frames is None,
+        "only --motion each takes some times of a scan; leave --time-frames.",
     )
     require(len(scans) > 0, "a series needs a scan at least; name one.")
     sources = tuple(_source(path, settings, prior, reading) for path in scans)
@@ -163,10 +163,10 @@ def plan_series(
 def _source(path: Path, settings: Settings, prior: Callable[[float], MaterialPrior], reading: Reading) -> Source:
     scan = read_frames(path, reading)
     times = times_of(scan)
-    fewest = 3 if settings.act == "track" else 1
+    fewest = {"track": 3, "flow": 3}.get(settings.act, 1)
     require(
         len(times) >= fewest,
-        f"bodies are followed through several times, but {path} has {len(times)}; leave --track.",
+        f"motion is found in {fewest} times or more, but {path} has {len(times)}; leave --motion.",
     )
     known = prior(scan.exposures.reference_energy)
     require_possible(settings.method, known, settings.matter)
@@ -191,7 +191,9 @@ def fingerprint(scan: Scan) -> str:
     return digest.hexdigest()[:16]
 
 
-Act = Literal["reconstruct", "track"]
+Act = Literal["reconstruct", "still", "flow", "track", "auto"]
+ACTS: dict[str, Act] = {"each": "reconstruct", "still": "still", "flow": "flow", "bodies": "track", "auto": "auto"}
+"""What is done, by the motion that is asked for."""
 
 
 @dataclass(frozen=True)
@@ -208,9 +210,9 @@ class Warm:
 @dataclass(frozen=True)
 @ranged
 class Settings:
-    """What is done with every time. act: `reconstruct` each by itself, or `track` bodies through all times of a task;
-    method, matter, warm: of reconstruct; motion: of track; reports: whether each run gets a report.html, which takes
-    seconds."""
+    """What is done with the times of a task. act: `reconstruct` each by itself, take all as `still`, let a `flow` carry
+    the matter, `track` bodies, or as frames choose (`auto`); method, matter: of all but flow and bodies; warm: of each
+    time by itself; motion: of bodies; reports: whether each run gets a report.html, which takes seconds."""
 
     act: Act = "reconstruct"
     method: Method = field(default_factory=Auto)
@@ -222,13 +224,14 @@ class Settings:
     reports: bool = False
 
     def __post_init__(self) -> None:
-        if self.act == "reconstruct" and self.warm.on:
+        if self.act in ("reconstruct", "auto") and self.warm.on:
             Continued.of(self.method, Path())  # which says what cannot
 
     def as_table(self) -> dict[str, Any]:
         """Plain values, ready for JSON; `from_table` reads them."""
         own = {"method": to_table(self.method), "matter": self.matter, "warm": to_table(self.warm)}
-        own = own if self.act == "reconstruct" else {"motion": to_table(self.motion)}
+        own = {} if self.act == "track" else own
+        own |= {"motion": to_table(self.motion)} if self.act in ("track", "auto") else {}
         return {"act": self.act, **own, "light": to_table(self.light), "seed": self.seed, "reports": self.reports}
 
     @classmethod

@@ -13,19 +13,24 @@ from typing import TypeVar
 import numpy as np
 
 from ..bodies.rest_shape import moments
-from ..checks import InputError, is_of_memory, reason_of, require
+from ..checks import InputError, as_written, is_of_memory, reason_of, require
+from ..inference import Decision
 from ..io.atomic import read_json, write_json
 from ..io.formats import read_frames, run_source
 from ..io.lock import sole_writer
 from ..io.reading import Reading
 from ..metrics import ImageScores
-from ..representations import MovingSurfaces
+from ..motion.timed_frames import merged
+from ..representations import InMotion, MovingSurfaces
 from ..scan import Scan
+from ..tables import read_rows
 from ..units import number_of
-from ..workflows.evaluate import Evaluation, evaluate
+from ..workflows.evaluate import TIMES, Evaluation, evaluate, write_times
+from ..workflows.motion_choice import FEWEST, Motion, choose_motion, motion_named
+from ..workflows.reconstruct import reconstruct
 from ..workflows.reconstruction import Reconstruction
 from ..workflows.run_folder import RunFolder, claimed
-from ..workflows.track import track
+from ..workflows.track import reconstruct_moving, track
 from .folder import DONE, FAILED, Row, SeriesFolder, TaskState, read_row, write_row
 from .one_time import (
     CONSERVED,
@@ -33,16 +38,20 @@ from .one_time import (
     Before,
     Shot,
     Told,
+    bodies_of,
     common_totals,
     is_conserved,
     is_spherical,
     is_worse,
     reconstruct_time,
     retry_time,
+    told_of,
     write_phase,
 )
-from .plan import Moment, SeriesPlan, Source, Window, fingerprint
+from .plan import ACTS, Moment, SeriesPlan, Source, Window, fingerprint
 
+MOTION = "motion.json"
+"""What was decided of how the matter of a task changes."""
 Result = TypeVar("Result")
 OnRow = Callable[[Row], None]
 """Called with every row that is written."""
@@ -91,10 +100,11 @@ class _Work:
 
     def run(self) -> str:
         """Do the times; why not all of them could be, or nothing."""
-        if self.plan.settings.act == "track":
-            source, run = self._source(self.window.moments[0]), RunFolder(self.folder.task(self.window.number) / "run")
-            rows = [_blank(moment, source) for moment in self.window.moments]
-            for row in track_window(self._scan(self.window.moments[0]), source, self.plan, rows, run):
+        motion, line = self._motion()
+        if motion != "each":
+            source, run = self._source(self.window.moments[0]), RunFolder(self.folder.whole(self.window.number))
+            rows = [replace(_blank(moment, source), decided=line) for moment in self.window.moments]
+            for row in window_of_one_run(self._scan(self.window.moments[0]), source, self.plan, rows, run, motion):
                 self._write(row)
             return ""
         warm, failed, before = self.plan.settings.warm.on, list[Row](), None
@@ -120,6 +130,25 @@ class _Work:
             again = (self._back, self._conserved) if warm else ()
             return "; ".join(filter(None, (each() for each in again)))
         return f"{len(failed)} of {len(self.window.moments)} times: {failed[0].reason}"
+
+    def _motion(self) -> tuple[Motion, str]:
+        """How the matter of the window changes, and the decision on that in words, which is made once; of few times,
+        each is taken by itself."""
+        settings, noted = self.plan.settings, self.folder.task(self.window.number) / MOTION
+        if settings.act != "auto":
+            return motion_named({act: name for name, act in ACTS.items()}[settings.act]), ""
+        if len(self.window.moments) < FEWEST:
+            return "each", ""
+        if noted.is_file():
+            with as_written(noted):
+                decision = Decision.from_dict(read_json(noted))
+        else:
+            moments, source = self.window.moments, self._source(self.window.moments[0])
+            part = _part(self._scan(moments[0]), moments[0].frame, moments[-1].frame)
+            asked = {"light": settings.light, "matter": settings.matter, "bodies": settings.motion}
+            decision = choose_motion(part, source.prior, settings.method, settings.seed, **asked)
+            write_json(noted, decision.as_dict())
+        return motion_named(decision.choice), decision.line
 
     def _back(self) -> str:
         """Go back over the finished times once, and try those again that are worse than the time after them
@@ -220,20 +249,43 @@ def opened(source: Source, reading: Reading) -> Scan:
     return scan
 
 
-def track_window(scan: Scan, source: Source, plan: SeriesPlan, rows: Sequence[Row], folder: RunFolder) -> list[Row]:
-    """Follow the bodies through the times of `rows`, and fill these in; an unfinished run is continued.
+def _part(scan: Scan, first: int, last: int) -> Scan:
+    """The frames of some times of a scan, in memory."""
+    return scan[np.flatnonzero(np.isin(scan.exposures.time, scan.instants[first : last + 1]))].in_memory()
 
-    Errors: `InputError` of `track`. Ctrl-C is passed on.
+
+def window_of_one_run(
+    scan: Scan, source: Source, plan: SeriesPlan, rows: Sequence[Row], folder: RunFolder, motion: Motion
+) -> list[Row]:
+    """Find what all times of `rows` have together, and fill these in; an unfinished run is continued. Where nothing
+    flows, matter is taken to be still.
+
+    Errors: `InputError` of `track`, `reconstruct_moving` and `reconstruct`. Ctrl-C is passed on.
     """
     began, settings = time.perf_counter(), plan.settings
     first, last = rows[0].frame, rows[-1].frame
-    part = scan[np.flatnonzero(np.isin(scan.exposures.time, scan.instants[first : last + 1]))].in_memory()
-    done = track(part, source.prior, settings.motion, settings.seed, light=settings.light, folder=folder, resume=True)
-    reading = replace(plan.reading, part=replace(plan.reading.part, time_frames=f"{first}:{last + 1}"))
+    part, prior, seed = _part(scan, first, last), source.prior, settings.seed
+    told = {"light": settings.light, "folder": folder, "resume": True}
+    moving = reconstruct_moving(part, prior, seed=seed, **told) if motion == "flow" else None
+    if motion == "bodies":
+        done = track(part, prior, settings.motion, seed, **told)
+    elif moving is not None:
+        done = moving.reconstruction
+    else:
+        done = reconstruct(merged(part), prior, settings.method, seed, matter=settings.matter, **told)
+    if not done.finished:
+        raise KeyboardInterrupt
+    how = {"time_frames": f"{first}:{last + 1}", "time_frame": "still" if motion != "bodies" and not moving else None}
+    reading = replace(plan.reading, part=replace(plan.reading.part, **how))
     with claimed(folder):
         folder.write_source(run_source(source.path, reading))
         evaluation = evaluate(done, part, None)
+        write_times(folder.path / TIMES, done, part, evaluation.light)
+        judged = read_rows(folder.path / TIMES, "what a task wrote")
         filled = [_filled(row, done, part, evaluation, folder) for row in rows]
+        filled = [
+            replace(row, good=said["explained"] == "1", words=said["verdict"]) for row, said in zip(filled, judged)
+        ]
         if settings.reports:
             from ..report.run import report_run  # which needs matplotlib
 
@@ -243,30 +295,22 @@ def track_window(scan: Scan, source: Source, plan: SeriesPlan, rows: Sequence[Ro
 
 
 def _filled(row: Row, done: Reconstruction, part: Scan, evaluation: Evaluation, folder: RunFolder) -> Row:
-    assert isinstance(done.object, MovingSurfaces)
-    when, verdict = part.exposures.time, done.verdict
-    now = done.object.at(row.time_s)
-    meshes = done.object.bodies(row.time_s)
-    measured = [moments(mesh)[:2] for mesh in meshes]
+    """`row` with what the run of all times says of its own."""
+    found, when = done.object, part.exposures.time
+    now = found.at(row.time_s) if isinstance(found, InMotion) else found
     scores = {
         "test": _means(evaluation.test, when[part.is_test] == row.time_s),
         "train": _means(evaluation.train, when[~part.is_test] == row.time_s),
     }
-    said = {} if verdict is None else {"good": verdict.good, "words": verdict.words}
-    held = float(sum(volume for volume, _ in measured)) * done.object.matter.delta
     write_phase(folder.path / f"t{row.number:04d}.{PHASE}", now, part[np.flatnonzero(when == row.time_s)])
-    return replace(
-        row,
-        status="done",
-        begun="cold",
-        kind=done.object.kind,
-        size=done.object.described,
-        bodies=tuple((*(float(x) for x in centre), float(volume)) for volume, centre in measured),
-        quantity="δ",
-        total=held,
-        **scores,
-        **said,
-    )
+    if isinstance(found, MovingSurfaces):
+        measured = [moments(mesh)[:2] for mesh in found.bodies(row.time_s)]
+        bodies = tuple((*(float(x) for x in centre), float(volume)) for volume, centre in measured)
+        told = {"quantity": "δ", "total": float(sum(volume for volume, _ in measured)) * found.matter.delta}
+    else:
+        bodies, told = bodies_of(now), {} if done.total is None else told_of(done.total)
+    row = replace(row, status="done", begun="cold", kind=found.kind, size=found.described, bodies=bodies)
+    return replace(row, **told, **scores)
 
 
 def _means(scores: ImageScores | None, chosen: np.ndarray) -> dict[str, float]:

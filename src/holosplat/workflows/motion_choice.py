@@ -17,6 +17,7 @@ from ..matter import MaterialPrior, MatterKind
 from ..methods import Auto, Method
 from ..methods.cross_validation import predicted_frames
 from ..motion.timed_frames import merged
+from ..motion.track import TrackOptions
 from ..optics.background import LightOptions
 from ..progress import FitProgress
 from ..scan import Scan
@@ -41,6 +42,7 @@ def choose_motion(
     *,
     light: LightOptions | None = None,
     matter: MatterKind | None = None,
+    bodies: TrackOptions = TrackOptions(),
     on_progress: FitProgress = lambda stage, fraction, record: None,
 ) -> Decision:
     """Whether each time is best taken by itself, or all as still matter, as matter that a flow carries, or as bodies.
@@ -66,7 +68,7 @@ def choose_motion(
     if may_flow(method, matter):
         ways["flow"] = carried
     if isinstance(method, Auto) and matter is None:
-        ways["bodies"] = lambda part: track(part, prior, seed=seed, light=light, on_progress=of("bodies")).object
+        ways["bodies"] = lambda part: track(part, prior, bodies, seed, light=light, on_progress=of("bodies")).object
     return decide(scan.train(), alone, ways)
 
 
@@ -75,13 +77,12 @@ def may_flow(method: Method, matter: MatterKind | None) -> bool:
     return isinstance(method, Auto) and matter != "levels"
 
 
-def motion_of(decision: Decision) -> Motion:
-    """The way that a decision took. Errors: `InputError` for one of something else."""
+def motion_named(name: str) -> Motion:
+    """The way of that name. Errors: `InputError` for any other."""
     known: dict[str, Motion] = {each: each for each in get_args(Motion)}
-    found = known.get(decision.choice)
-    if found is None:
-        raise InputError(f"the motion must be one of {', '.join(known)}, but it is {decision.choice[:40]!r}.")
-    return found
+    if name not in known:
+        raise InputError(f"the motion must be one of {', '.join(known)}, but it is {name[:40]!r}.")
+    return known[name]
 
 
 def begun_motion(folder: Path) -> Decision | None:
@@ -93,7 +94,7 @@ def begun_motion(folder: Path) -> Decision | None:
         said = next((each["decided"][MOTION] for each in records(folder) if MOTION in each.get("decided", {})), None)
         found = None if said is None else Decision.from_dict(said)
         if found is not None:
-            motion_of(found)
+            motion_named(found.choice)
         return found
 
 
