@@ -48,7 +48,8 @@ def test_each_window_is_taken_as_its_frames_choose(files, tmp_path, chosen):
     rows = read_rows(collected(folder), "")
     assert [row["run"].split("/")[-1] for row in rows] == ["run", "run", "t0002", "t0003", "t0004"]
     assert [row["decided"] for row in rows[:2]] == [Decision("motion", "still", "times set aside").line] * 2
-    assert {row["explained"] for row in rows} <= {"0", "1"}
+    judged = read_rows(folder.whole(0) / "times.csv", "")
+    assert [(row["explained"], row["verdict"]) for row in rows[:2]] == [(e["explained"], e["verdict"]) for e in judged]
     assert [row["begun"] for row in rows[2:]] == ["cold", rows[3]["begun"], "cold"]
     out = tmp_path / "v.h5"
     worked(holosplat("export", folder.path, "--volume", out, "--time-frame", "all"))
@@ -67,12 +68,15 @@ def collected(folder: SeriesFolder):
 
 
 @pytest.mark.usefixtures("unjudged_runs")
-def test_a_still_window_is_one_run_of_the_mean_of_its_times(files, tmp_path):
+def test_a_still_window_is_one_run_of_all_its_frames(files, tmp_path):
+    """Which the run knows again: it is evaluated as it was found."""
     folder = planned(tmp_path / "series", files.scan, 5, replace(SETTINGS, act="still"))
     run_left(folder)
     run = RunFolder(folder.whole(0))
     assert read_json(run.source)["time_frame"] == "still"
-    again = worked(holosplat("evaluate", run.path)).out
-    assert "held-out" in again or "test" in again
+    again = worked(holosplat("evaluate", run.path))
+    assert "not the scan that was reconstructed" not in again.out + again.err
+    (line,) = [line for line in again.out.splitlines() if line.startswith("training frames")]
+    assert "SSIM" in line
     rows = read_rows(collected(folder), "")
     assert len({row["total_m3"] for row in rows}) == 1

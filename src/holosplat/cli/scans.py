@@ -195,10 +195,14 @@ def side_of_run(path: Path) -> Side:
 
 def rehearse_each(run: Path, times: int, bins: int | None, reading: Reading) -> None:
     """Rehearse a run, or every time that is done of a series, whose table is then written again."""
-    each = {folder.path: (number, folder) for number, (_, folder) in reversed(list(enumerate(runs_of(run))))}
-    for number, folder in sorted(each.values(), key=lambda one: one[0]):
-        if folder.result().is_file():
-            say(f"time {number}:")
+    each, seen = runs_of(run), set[Path]()
+    for number, (_, folder) in enumerate(each):
+        if folder.path in seen or not folder.result().is_file():
+            continue
+        seen.add(folder.path)
+        moves = bool(instants_of(folder))
+        say(f"time {number}: {f'not rehearsed, for {folder.path} is of matter in motion' if moves else ''}".rstrip())
+        if not moves:
             _rehearse(folder, times, bins, reading)
     if each:
         collect(series := SeriesFolder(run))

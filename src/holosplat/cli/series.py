@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from tyro.conf import Positional, arg, subcommand
 
@@ -19,7 +19,7 @@ from ..planning.scan_facts import smaller
 from ..ranges import Jobs, Seed, checked_dataclass
 from ..series.collect import collect as join
 from ..series.folder import Row, SeriesFolder, line_of, table_of, time_left, verdict_of
-from ..series.plan import ACTS, Cut, Settings, Slurm, Warm, listed, plan_series
+from ..series.plan import ACTS, AskedMotion, Cut, Settings, Slurm, Warm, listed, plan_series
 from ..series.run import Counts, counted, run_left, run_on_dask, run_processes, states, submit, write_script
 from ..series.stream import RECEIVED, SCHEME, Stream, Streaming
 from ..series.task import run_task
@@ -33,7 +33,6 @@ from .places import Kept, Output, with_checked_arguments
 from .sentence import interruptible, put, say, tell
 from .track import BodyFlags, MotionFlags
 
-AskedMotion = Literal["each", "still", "flow", "bodies", "auto"]
 UNFINISHED = 4
 """Exit code of `series run` and `collect` where tasks failed or are left."""
 

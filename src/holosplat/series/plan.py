@@ -24,6 +24,7 @@ from ..optics.background import LightOptions
 from ..ranges import Natural, Seed, ranged
 from ..scan import Scan
 from ..tables import from_table, to_table
+from ..workflows.motion_choice import Motion
 
 FORMAT = "holosplat series 1"
 MOST_TIMES = 100_000
@@ -192,7 +193,14 @@ def fingerprint(scan: Scan) -> str:
 
 
 Act = Literal["reconstruct", "still", "flow", "track", "auto"]
-ACTS: dict[str, Act] = {"each": "reconstruct", "still": "still", "flow": "flow", "bodies": "track", "auto": "auto"}
+AskedMotion = Literal[Motion, "auto"]
+ACTS: dict[AskedMotion, Act] = {
+    "each": "reconstruct",
+    "still": "still",
+    "flow": "flow",
+    "bodies": "track",
+    "auto": "auto",
+}
 """What is done, by the motion that is asked for."""
 
 
@@ -226,6 +234,11 @@ class Settings:
     def __post_init__(self) -> None:
         if self.act in ("reconstruct", "auto") and self.warm.on:
             Continued.of(self.method, Path())  # which says what cannot
+
+    @property
+    def asked(self) -> AskedMotion:
+        """The motion that is asked for."""
+        return next(name for name, act in ACTS.items() if act == self.act)
 
     def as_table(self) -> dict[str, Any]:
         """Plain values, ready for JSON; `from_table` reads them."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -20,7 +20,6 @@ from ..io.formats import read_frames, run_source
 from ..io.lock import sole_writer
 from ..io.reading import Reading
 from ..metrics import ImageScores
-from ..motion.timed_frames import merged
 from ..representations import InMotion, MovingSurfaces
 from ..scan import Scan
 from ..tables import read_rows
@@ -48,7 +47,7 @@ from .one_time import (
     told_of,
     write_phase,
 )
-from .plan import ACTS, Moment, SeriesPlan, Source, Window, fingerprint
+from .plan import Moment, SeriesPlan, Source, Window, fingerprint
 
 MOTION = "motion.json"
 """What was decided of how the matter of a task changes."""
@@ -136,7 +135,7 @@ class _Work:
         each is taken by itself."""
         settings, noted = self.plan.settings, self.folder.task(self.window.number) / MOTION
         if settings.act != "auto":
-            return motion_named({act: name for name, act in ACTS.items()}[settings.act]), ""
+            return motion_named(settings.asked), ""
         if len(self.window.moments) < FEWEST:
             return "each", ""
         if noted.is_file():
@@ -272,7 +271,7 @@ def window_of_one_run(
     elif moving is not None:
         done = moving.reconstruction
     else:
-        done = reconstruct(merged(part), prior, settings.method, seed, matter=settings.matter, **told)
+        done = reconstruct(part.as_static(), prior, settings.method, seed, matter=settings.matter, **told)
     if not done.finished:
         raise KeyboardInterrupt
     how = {"time_frames": f"{first}:{last + 1}", "time_frame": "still" if motion != "bodies" and not moving else None}
@@ -282,10 +281,7 @@ def window_of_one_run(
         evaluation = evaluate(done, part, None)
         write_times(folder.path / TIMES, done, part, evaluation.light)
         judged = read_rows(folder.path / TIMES, "what a task wrote")
-        filled = [_filled(row, done, part, evaluation, folder) for row in rows]
-        filled = [
-            replace(row, good=said["explained"] == "1", words=said["verdict"]) for row, said in zip(filled, judged)
-        ]
+        filled = [_filled(row, done, part, evaluation, folder, said) for row, said in zip(rows, judged)]
         if settings.reports:
             from ..report.run import report_run  # which needs matplotlib
 
@@ -294,8 +290,10 @@ def window_of_one_run(
     return [replace(row, seconds=seconds) for row in filled]
 
 
-def _filled(row: Row, done: Reconstruction, part: Scan, evaluation: Evaluation, folder: RunFolder) -> Row:
-    """`row` with what the run of all times says of its own."""
+def _filled(
+    row: Row, done: Reconstruction, part: Scan, evaluation: Evaluation, folder: RunFolder, said: Mapping[str, str]
+) -> Row:
+    """`row` with what the run of all times says of its own; said: its row of times.csv."""
     found, when = done.object, part.exposures.time
     now = found.at(row.time_s) if isinstance(found, InMotion) else found
     scores = {
@@ -310,7 +308,7 @@ def _filled(row: Row, done: Reconstruction, part: Scan, evaluation: Evaluation, 
     else:
         bodies, told = bodies_of(now), {} if done.total is None else told_of(done.total)
     row = replace(row, status="done", begun="cold", kind=found.kind, size=found.described, bodies=bodies)
-    return replace(row, **told, **scores)
+    return replace(row, good=said["explained"] == "1", words=said["verdict"], **told, **scores)
 
 
 def _means(scores: ImageScores | None, chosen: np.ndarray) -> dict[str, float]:
