@@ -182,11 +182,9 @@ class Fit:
 
     def result(self) -> Model:
         """The best model by the validation frames or the optimiser, or else the last one; it carries no gradients."""
-        found = self.trainable.optimiser.best()
-        if found is None:
-            judged = self.plan.judge is not None and self._best.step > 0
-            found = self._best.leaves if judged else self.trainable.snapshot()
-        return self.plan.problem.model.with_parameters(found)
+        judged = self.plan.judge is not None and self._best.step > 0
+        found = self._best.leaves if judged else self.trainable.optimiser.best()
+        return self.plan.problem.model.with_parameters(self.trainable.snapshot() if found is None else found)
 
     def left(self) -> float:
         """The loss of all frames, and of terms on the object, that the result has."""

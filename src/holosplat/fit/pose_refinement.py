@@ -120,10 +120,11 @@ def with_alignment(exposures: Exposures, alignment: Alignment) -> Exposures:
     )
 
 
-def with_pose_refinement(plan: Plan, freedom: PoseRefinement | None, train: Scan) -> Plan:
+def with_pose_refinement(plan: Plan, freedom: PoseRefinement | None, train: Scan, nat: float | None = None) -> Plan:
     """`plan` with the geometry of its frames `train` as free as `freedom` says; as it is where nothing is free.
 
-    freedom: of these frames and those that are set aside for validation, which stay where they are.
+    freedom: of these frames and those that are set aside for validation, which stay where they are; nat: a unit of
+    minus the logarithm of a probability in that of the loss (None: of a loss that is a mean over pixels of about |r|).
     Steps are Adam's, with the rates' decay; the prior is that of `PoseRefinement`, and what no frame can tell is kept
     (`Gauge`).
     """
@@ -134,15 +135,17 @@ def with_pose_refinement(plan: Plan, freedom: PoseRefinement | None, train: Scan
     model, exposures = plan.problem.model, train.exposures
     on = model.instrument.device
     alignment = freedom.alignment(on)
-    (h, w), frames = exposures.views.shape, torch.from_numpy(train.frames)
-    level = max(ROUNDED * float(noise_levels(train.measured).mean() / (frames.max() - frames.min())), LEAST_LEFT)
+    h, w = exposures.views.shape
+    if nat is None:
+        noise = float(noise_levels(train.measured).mean()) / np.ptp(train.frames)
+        nat = max(ROUNDED * noise, LEAST_LEFT) / train.frames.size
     own = {
         "alignment.shifts": RATE_PX,
         "alignment.turns": RATE_PX / (0.5 * max(h, w)),
         "alignment.stretches": RATE_SHARE * freedom.distance,
         "alignment.magnified": RATE_PX / (0.5 * max(h, w)),
     }
-    expected = GeometryPrior(freedom, level / (h * w * len(train)), on)
+    expected = GeometryPrior(freedom, nat, on)
 
     def rates(factor: float, step: int) -> Mapping[str, float]:
         return {**plan.rates(factor, step), **{name: rate * factor for name, rate in own.items()}}

@@ -241,11 +241,9 @@ class QuasiNewton:
             if not self._stuck:
                 self._turn()
 
-    def best(self) -> Leaves:
-        """The point that was accepted last; `InputError` before the first step."""
-        if self._point is None:
-            raise InputError("the fit has made no step; raise its number of steps.")
-        return {self._name: self._point}
+    def best(self) -> Leaves | None:
+        """The point that was accepted last; None before the first step."""
+        return None if self._point is None else {self._name: self._point}
 
     def resize(self, names: list[str], keep: Tensor, added: Mapping[str, Tensor]) -> None:
         """Begin anew from the resized leaf."""

@@ -18,13 +18,13 @@ from torch.nn.functional import avg_pool2d
 from ..checks import at_least
 from ..matter import DeltaBeta
 from ..optics.noise import noise_levels
-from ..ranges import Pixels, Positive, Share, Weight, checked_dataclass
+from ..ranges import Pixels, Share, Weight, checked_dataclass
 from ..representations import GaussianCloud, SurfaceMesh
 from ..representations.isosurface import edge_lengths, loop_subdivision
 from ..scan import Scan
 from .cross_validation import MissingMatter
 from .method import Task, run_quietly
-from .surface_fit import SurfaceFit, SurfaceOptions, frames_of, softened, surface_fit
+from .surface_fit import SurfaceFit, SurfaceOptions, frames_of, surface_fit
 
 STAGE = "coarse pixels"
 FEWEST_ROWS = 32
@@ -67,12 +67,6 @@ class CoarseToFine:
     """Steps on these, which cost most."""
     views: int = 12
     """Frames for which these steps are enough: of fewer, each tells less and costs less, and there are more steps."""
-    near_rate: Weight = 0.1
-    """Length of their first steps [pixels]: half of what surfaces cut out of Gaussians need."""
-    near_edge: Positive = 1.0
-    """Mean length of triangles' edges [pixels] beyond which stiffness and bending count in these steps as on edges of
-    this length, about that of marching cubes: by longer edges they smooth over more pixels, and surfaces end farther
-    away (method, "How many triangles")."""
     edge: Pixels = 1.5
     """Mean length of triangles' edges [pixels] from which on they are divided on pixels between."""
     last_edge: Pixels = 2.5
@@ -95,17 +89,9 @@ class CoarseToFine:
             factor *= 2
         return factor
 
-    def nearby(self, fit: SurfaceFit, start: SurfaceMesh) -> SurfaceFit:
-        """The fit of `start`, near to surfaces of the frames' own pixels: fewer and shorter steps, no stiffer ones."""
-        return self._short(fit, start, self.last_steps)
-
-    def between(self, fit: SurfaceFit, start: SurfaceMesh) -> SurfaceFit:
-        """The fit of `start` on pixels between the coarsest and the frames' own."""
-        return self._short(fit, start, self.finer_steps)
-
-    def _short(self, fit: SurfaceFit, start: SurfaceMesh, steps: int) -> SurfaceFit:
-        fit = softened(fit, start, self.near_edge)
-        return replace(fit, schedule=replace(fit.schedule, steps=steps), rate=self.near_rate)
+    def nearby(self, fit: SurfaceFit) -> SurfaceFit:
+        """The fit of surfaces near to those of the frames' own pixels: fewer steps."""
+        return in_steps(fit, self.last_steps)
 
     def of_views(self, count: int) -> CoarseToFine:
         """The same with steps for so many frames: as many looks at them in all as for `views`."""
@@ -117,6 +103,11 @@ class CoarseToFine:
         """The same with `effort` times the steps, at least one."""
         names = ("coarse_steps", "finer_steps", "last_steps", "fit_steps")
         return replace(self, **{name: max(1, round(effort * getattr(self, name))) for name in names})
+
+
+def in_steps(fit: SurfaceFit, steps: int) -> SurfaceFit:
+    """The same fit in so many steps."""
+    return replace(fit, schedule=replace(fit.schedule, steps=steps))
 
 
 Way = Callable[[SurfaceMesh | None], SurfaceMesh | None]
@@ -149,7 +140,7 @@ def coarse_surfaces(
         factor //= 2
     found = on_pixels(found, task.scan.views.finest, how.last_edge)
     if unexplained(found, task.scan, surfaces) > most:
-        found = _run(replace(task, freedom=None), found, how.nearby(surfaces.fit, found))  # edges may be off by more
+        found = _run(replace(task, freedom=None), found, how.nearby(surfaces.fit))  # edges may be off by more
         if unexplained(found, task.scan, surfaces) > most:
             return None, found
     return found, None
@@ -158,7 +149,7 @@ def coarse_surfaces(
 def last_steps(task: Task, found: SurfaceMesh, surfaces: SurfaceOptions, how: CoarseToFine) -> SurfaceMesh:
     """The surfaces that `coarse_surfaces` has `found`, fitted to the frames of `task` themselves."""
     how = how.of_views(len(task.scan.train()))
-    return _run(replace(task, freedom=None), found, how.nearby(surfaces.fit, found))
+    return _run(replace(task, freedom=None), found, how.nearby(surfaces.fit))
 
 
 def binned(task: Task, factor: int) -> Task:
@@ -197,14 +188,13 @@ def first_of(task: Task, ways: Sequence[Way], surfaces: SurfaceOptions, how: Coa
 
 def settled(task: Task, start: SurfaceMesh, surfaces: SurfaceOptions, how: CoarseToFine) -> SurfaceMesh:
     """The surfaces `start` after `how.coarse_steps` on the pixels of `task`."""
-    schedule = replace(surfaces.fit.schedule, steps=how.coarse_steps)
-    return _run(task, start, replace(surfaces.fit, schedule=schedule))
+    return _run(task, start, in_steps(surfaces.fit, how.coarse_steps))
 
 
 def _fitted(task: Task, found: SurfaceMesh, surfaces: SurfaceOptions, how: CoarseToFine) -> SurfaceMesh:
     """The surfaces on the pixels of `task`."""
     start = on_pixels(found, task.scan.views.finest, how.edge)
-    return _run(task, start, how.between(surfaces.fit, start))
+    return _run(task, start, in_steps(surfaces.fit, how.finer_steps))
 
 
 def _run(task: Task, start: SurfaceMesh, options: SurfaceFit) -> SurfaceMesh:

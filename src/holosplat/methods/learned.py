@@ -13,6 +13,7 @@ free of the shape at rest, and each cell is tried as its twin (`bodies.poses`), 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -28,7 +29,7 @@ from ..learning.start import Guessed, GuessedMatter, guess_matter
 from ..matter import DeltaBeta, Matter
 from ..mesh import TriangleMesh
 from ..representations import GaussianCloud, SurfaceMesh
-from .coarse import Way, first_of
+from .coarse import Way, first_of, in_steps
 from .cross_validation import BY_FISSION, Folds, predicted_frames
 from .gaussian_options import GaussianOptions
 from .method import Task, run_quietly
@@ -177,13 +178,11 @@ def _away(posed: _Posed, number: int, beams: np.ndarray) -> float:
 
 def _fitted(task: Task, posed: _Posed, steps: int) -> tuple[float, _Posed]:
     """What is left of the frames after so many steps, and the cells."""
-    how = SurfaceFit()
-    how = replace(how, schedule=replace(how.schedule, steps=steps))
-    fit = surface_fit(task.scan, posed.surfaces(), how, task.seed, task.uneven)
+    fit = surface_fit(task.scan, posed.surfaces(), in_steps(SurfaceFit(), steps), task.seed, task.uneven)
     fit.run(lambda record: None)
     found = fit.result().object
     assert isinstance(found, SurfaceMesh)
-    return fit.left(), posed.moved_to(found)
+    return math.exp(fit.left()), posed.moved_to(found)
 
 
 STAGE = "starts"
@@ -307,8 +306,7 @@ def _surfaces(task: Task, cloud: GaussianCloud, steps: int) -> SurfaceMesh | Non
 
 def _settled(task: Task, start: SurfaceMesh, steps: int) -> SurfaceMesh:
     """Surfaces after so many steps."""
-    fit = SurfaceFit()
-    fit = replace(fit, schedule=replace(fit.schedule, steps=steps), backend=start.backend)
+    fit = replace(in_steps(SurfaceFit(), steps), backend=start.backend)
     return run_quietly(surface_fit(task.scan, start, fit, task.seed, task.uneven), task.report(STAGE), SurfaceMesh)
 
 

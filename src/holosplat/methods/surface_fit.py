@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 import torch
 from scipy.ndimage import binary_dilation
-from scipy.sparse import csc_array, csr_array, diags_array, eye_array
+from scipy.sparse import csc_array, diags_array, eye_array
 from scipy.sparse.linalg import splu
 from torch import Tensor
 
@@ -18,20 +18,21 @@ from ..baselines.beyond import MULTIPLE
 from ..baselines.two_materials import told_apart
 from ..checks import in_range, positive, require
 from ..fit.loop import Fit, Plan
-from ..fit.optimiser import Adam, Group
+from ..fit.optimiser import Adam, Group, Leaves, Optimiser
 from ..fit.pose_refinement import PoseRefinement, with_pose_refinement
-from ..fit.problem import Problem, Schedule, Term
+from ..fit.problem import Problem, Schedule
+from ..fit.projected_gradient import QuasiNewton
 from ..fit.terms import Objective
-from ..fit.terms.object import Bending, membrane_inverse
+from ..fit.terms.frames import ProfileLikelihood
+from ..fit.terms.object import CurvatureVariation, membrane_inverse
 from ..geometry import Grid, Views
 from ..matter import Matter
 from ..mesh import TriangleMesh
 from ..optics.background import Light
-from ..optics.noise import noise_share
 from ..optics.sampling import fringe_sampling
 from ..ranges import Rate, Weight, checked_dataclass
 from ..representations import GaussianCloud, SurfaceMesh, isosurface
-from ..representations.isosurface import adjacency, edge_lengths, neighbour_mean
+from ..representations.isosurface import adjacency
 from ..scan import Scan
 from .cross_validation import predicted_frames
 from .ground import ExtraTerm, ground
@@ -39,6 +40,8 @@ from .ground import ExtraTerm, ground
 VERTICES = "object.vertices"
 BETAS, EPSILON = (0.9, 0.99), 1e-30
 """Adam's constants for vertices (Nicolet et al. 2021)."""
+MEMORY = 20
+"""Pairs of steps and gradients that L-BFGS remembers."""
 FINEST = 0.25
 """Edge of voxels [pixels] at which surfaces are cut out, at least."""
 NEAR = 2
@@ -73,13 +76,16 @@ class SurfaceFit:
     """Options of the fit of surfaces to frames."""
 
     rate: Rate = 0.2
-    """Length of the first steps [pixels], the same for all vertices."""
-    stiffness: Weight = 10.0
-    """How far a vertex draws its neighbours along, λ of Nicolet et al. (2021)."""
-    objective: Objective = field(
-        default_factory=lambda: Objective(l1=0.0, rounded=1.0, rounding=3.0, bending=1.0, noise_gain=3.0)
-    )
-    """How frames are compared, and what bending costs."""
+    """Length of the first step [pixels], of the vertex that moves most; others are ten times as long at most."""
+    worth: Weight = 5.0
+    """Least log-likelihood gain of a step [nats], averaged over ten, for the fit to continue: by about as much any
+    number moves it that the frames do not tell (Akaike 1974)."""
+    stiffness: Weight = 2.0
+    """How far a vertex draws its neighbours along in a step, λ of Nicolet et al. (2021); ends do not depend on it."""
+    curvature: Weight = 3.0
+    """Prior of smooth shapes: κ of ½ κ R² ∫ |∇H|² dA of each body [nats], H its mean curvature, R = 3 V/A."""
+    objective: Objective = field(default_factory=lambda: Objective(l1=0.0, rounded=1.0, rounding=3.0))
+    """How frames are compared; their noise is what the surfaces leave of each view."""
     schedule: Schedule = field(default_factory=lambda: Schedule(steps=100, decay=0.1))
     """The loop; waves are sampled one finer than for Gaussians unless it says how, for edges are sharper."""
     terms: tuple[ExtraTerm, ...] = ()
@@ -175,51 +181,38 @@ def surface_fit(
 ) -> Fit:
     """The fit of the surfaces `start` to the training frames of `scan`, of the same triangles, made ready.
 
-    freedom: of where these frames are, which is then fitted, too. Steps are Adam's in the coordinates (1 + λΔ) x, one
-    length for all vertices (Nicolet, Jacobson & Jakob 2021, "Large steps in inverse rendering of geometry", section 3).
+    freedom: of where these frames are, which is then fitted, too. Steps are those of L-BFGS in the coordinates
+    (1 + λΔ) x (Nicolet, Jacobson & Jakob 2021, "Large steps in inverse rendering of geometry", section 3), which need
+    the whole objective, so that `views_per_step` is how many frames are in memory at a time; with a `freedom`, Adam's.
     """
     finer, backend, schedule = oversampling(scan.train(), options), resolve(options.backend), options.schedule
+    if schedule.views_per_step and not freedom:
+        schedule = replace(schedule, views_per_step=0, views_at_once=schedule.views_per_step)
     start = start.on(backend)
     base = ground(scan, start, start.matter, options.objective, schedule, backend, finer=finer, light=light)
-    terms = (base.frames, *_bending(base.train, start, options.objective), *base.extra(options.terms))
+    frames = ProfileLikelihood(base.frames, base.train.frames.size)
+    prior = [CurvatureVariation(options.curvature * frames.nat, start)] if options.curvature > 0 else []
     solve = (_membrane_on_gpu if backend == "cuda" else _membrane)(start, options.stiffness)
-    group = Group(BETAS, EPSILON, solve=solve, together=True)
+
+    def optimiser(leaves: Leaves) -> Optimiser:
+        if freedom:  # poses move the objective between the steps of vertices
+            return Adam(leaves, backend, {VERTICES: Group(BETAS, EPSILON, solve=solve, together=True)})
+        return QuasiNewton(leaves, lambda slope: solve(solve(slope)), MEMORY, options.worth * frames.nat)
+
     plan = Plan(
-        problem=Problem(base.model, terms),
+        problem=Problem(base.model, (frames, *prior, *base.extra(options.terms))),
         schedule=schedule,
-        optimiser=lambda leaves: Adam(leaves, backend, {VERTICES: group}),
-        rates=lambda factor, step: {VERTICES: options.rate * factor},
+        optimiser=optimiser,
+        rates=lambda factor, step: {VERTICES: options.rate * (factor if freedom else 1.0)},
         judge=base.judge,
         capture=False,  # not yet tried as a CUDA graph
     )
-    return Fit(with_pose_refinement(plan, freedom, base.train), seed)
-
-
-def softened(options: SurfaceFit, start: SurfaceMesh, edge: float) -> SurfaceFit:
-    """The options with stiffness and bending as on edges of `edge` [pixels], where those of `start` are longer in the
-    mean; else as they are.
-
-    The mean of a vertex' neighbours is h²/4 times the Laplacian away, if edges h are alike: λ reaches as far as λ h²
-    does, and Σ |L² x|² is h⁸ times the square of Δ² x, on h⁻² vertices a pixel².
-    """
-    longer = max(1.0, float(edge_lengths(start.vertices.detach(), start.faces).mean()) / edge)
-    objective = replace(options.objective, bending=options.objective.bending / longer**6)
-    return replace(options, stiffness=options.stiffness / longer**2, objective=objective)
+    return Fit(with_pose_refinement(plan, freedom, base.train, frames.nat), seed)
 
 
 def oversampling(scan: Scan, options: SurfaceFit = SurfaceFit()) -> int:
     """Wave samples along a pixel at which surfaces are fitted and judged: their edges are sharper than Gaussians'."""
     return options.schedule.oversample or fringe_sampling(scan.exposures, extra=1)
-
-
-def _bending(train: Scan, start: SurfaceMesh, objective: Objective) -> list[Term]:
-    if objective.bending == 0:
-        return []
-    frames = train.measured
-    weight = objective.bending * (1 + objective.noise_gain * noise_share(frames)) / frames[0].numel()
-    count = len(start.vertices)
-    away = csr_array(eye_array(count) - neighbour_mean(start.faces.cpu().numpy(), count))
-    return [Bending(weight, csr_array(away @ away), start.backend)]
 
 
 def _membrane(start: SurfaceMesh, stiffness: float) -> Callable[[Tensor], Tensor]:

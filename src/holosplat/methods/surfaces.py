@@ -225,7 +225,7 @@ class SurfaceStage:
         """The fit of the surfaces to the training frames."""
         assert isinstance(start, SurfaceMesh)
         coarse = self.coarse.of_views(len(task.scan.train()))
-        options = coarse.nearby(self.options.fit, start) if task.near else self.options.fit
+        options = coarse.nearby(self.options.fit) if task.near else self.options.fit
         freedom = task.freedom and replace(task.freedom, edges=task.prior.kind == "known")
         return surface_fit(task.scan, start, options, task.seed, task.uneven, freedom)
 

@@ -8,13 +8,15 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.sparse import csr_array, diags_array
+from scipy.sparse import csr_array, diags_array, triu
 from torch import Tensor
+from torch.nn.functional import normalize
 
-from ...backends import device
 from ...geometry import Grid
+from ...mesh import shell_labels
 from ...model import Model
-from ...representations import GaussianCloud
+from ...representations import GaussianCloud, SurfaceMesh
+from ...representations.isosurface import adjacency
 from ..problem import FIXED, Batch, LossPart
 from ..total_variation import total_variation
 from . import comparisons
@@ -80,26 +82,53 @@ class Anisotropy:
         return [LossPart("anisotropy", self._weight, comparisons.anisotropy(cloud.log_scales, self._limit))]
 
 
-class Bending:
-    """Σ |L² x|² of the vertices x [pixels] of surfaces, L x their distance from the mean of their neighbours."""
+class CurvatureVariation:
+    """½ Σ over bodies of R² ∫ |∇H|² dA of surfaces, H the mean curvature, R = 3 V/A of a body's volume and area.
 
-    names = ("bending",)
+    The energy of minimum variation (Moreton & Séquin 1992, "Functional optimization for fair surface design",
+    section 3) in units of the body's own size: balls and tubes have none, and a shape as much at any size. The
+    mean of a vertex' neighbours is u away, n·u = h²/4 · 2H along the normal n on even triangles of edges h; R and h are
+    those at the start. The same of u across the normal keeps triangles even.
+    """
 
-    def __init__(self, weight: float, operator: csr_array, backend: str = "cpu") -> None:
-        """operator: L² [P, P], sparse float64; backend: resolved, of the vertices."""
-        pair, on = (operator, csr_array(operator.T)), device(backend)
-        self._operators = (Neighbours(pair[0], on), Neighbours(pair[1], on)) if backend == "cuda" else pair
-        self._weight = weight
-        self.resolved = {"bending": weight}
+    names = ("curvature",)
+
+    def __init__(self, weight: float, start: SurfaceMesh) -> None:
+        """weight: of the energy; start: the surfaces at the beginning, whose triangles stay."""
+        self._weight, self.resolved = weight, {"curvature": weight}
+        faces, points = start.faces.cpu().numpy(), start.vertices.detach().cpu().double().numpy()
+        a, b, c = np.moveaxis(points[faces], 1, 0)
+        normals = np.cross(b - a, c - a)
+        shells = shell_labels(faces, len(points))
+        areas = np.bincount(shells, 0.5 * np.linalg.norm(normals, axis=1))
+        volumes = np.bincount(shells, np.einsum("fi,fi->f", a, normals) / 6)
+        radius, cell = 3 * np.abs(volumes) / areas, areas / (0.5 * np.bincount(shells))
+        # a vertex has half its triangles, √3/2 h², and three edges, whose Σ (h²/2 · h ∂H)² is 3/2 (h³/2 |∇H|)²: in all
+        # cell²/√3 ∫ |∇H|² dA
+        of_vertex = np.zeros(len(points))
+        of_vertex[faces] = (np.sqrt(3) * (radius / cell) ** 2)[shells][:, None]
+        edges = adjacency(faces, len(points))
+        upper, there = triu(edges, format="coo"), start.vertices.device
+        self._ends = torch.from_numpy(np.stack([upper.row, upper.col]).astype(np.int64)).to(there)
+        self._stiffness = torch.from_numpy(of_vertex[upper.row]).to(there)
+        self._degree = torch.from_numpy(np.maximum(edges.sum(1), 1))[:, None].to(there)
+        self._faces = start.faces.long()
 
     def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
         """The one part."""
-        vertices = model.parameters()["object.vertices"]
-        return [LossPart("bending", self._weight, squared_product(vertices, *self._operators))]
+        x, (i, j) = model.parameters()["object.vertices"], self._ends
+        a, b, c = (x[self._faces[:, k]] for k in range(3))
+        across = torch.linalg.cross(b - a, c - a).repeat(3, 1)
+        normals = normalize(torch.zeros_like(x).index_add(0, self._faces.T.flatten(), across), dim=1)
+        away = x - torch.zeros_like(x).index_add(0, i, x[j]).index_add(0, j, x[i]) / self._degree
+        along = (normals * away).sum(1)
+        aside = away - normals * along[:, None]
+        change = (along[i] - along[j]).square() + (aside[i] - aside[j]).square().sum(1)
+        return [LossPart("curvature", self._weight, 0.5 * (self._stiffness * change).sum())]
 
 
-def squared_product(x: Tensor, matrix: csr_array | Neighbours, transposed: csr_array | Neighbours) -> Tensor:
-    """Σ (A x)² [] of x [P, C], differentiable; matrix, transposed: A and Aᵀ, of scipy on the CPU, or where x is."""
+def squared_product(x: Tensor, matrix: csr_array, transposed: csr_array) -> Tensor:
+    """Σ (A x)² [] of x [P, C] on the CPU, differentiable; matrix, transposed: A and Aᵀ."""
     found = _SquaredProduct.apply(x, matrix, transposed)
     assert isinstance(found, Tensor)
     return found
@@ -109,13 +138,7 @@ class _SquaredProduct(torch.autograd.Function):
     """Σ (A x)² of a sparse A; torch's own backward pass would transpose A anew in every step."""
 
     @staticmethod
-    def forward(  # type: ignore[override]
-        ctx: Any, x: Tensor, matrix: csr_array | Neighbours, transposed: csr_array | Neighbours
-    ) -> Tensor:
-        if isinstance(matrix, Neighbours):
-            found = matrix @ x.detach()
-            ctx.slope = 2 * (transposed @ found)
-            return found.square().sum()
+    def forward(ctx: Any, x: Tensor, matrix: csr_array, transposed: csr_array) -> Tensor:  # type: ignore[override]
         product = matrix @ x.detach().numpy()
         ctx.slope = torch.from_numpy(2 * (transposed @ product))
         return x.new_tensor(np.square(product).sum())
