@@ -106,18 +106,6 @@ def compact_series() -> str:
     return markdown(("objects", "as runs hold them", "compact, each by itself", "in one file"), lines)
 
 
-@table("triangles", "python benchmarks/triangles.py --csv docs/data/triangles.csv", "half an hour", "triangles.csv")
-def triangles() -> str:
-    """Surfaces on fine pixels by more and fewer triangles."""
-    lines = list[list[str]]()
-    for row in sorted(read("triangles.csv"), key=lambda row: (-int(row["pixels"]), row["photons"])):
-        of = [row["pixels"], row["photons"] or "–", row["seed"], row["variant"], row["triangles"]]
-        scores = [rounded(row[name], 4) for name in ("ssim", "frcm", "dice", "relative_error_delta")]
-        lines.append([*of, f"{float(row['seconds']):.0f}", *scores, row["stages"]])
-    head = ("pixels", "photons", "seed", "triangles that are", "in all", "processor time / s", "SSIM", "FRCM", "Dice")
-    return markdown((*head, "error of δ", "on the way"), lines)
-
-
 @table("thick-cell", "python benchmarks/thick_cell.py DATA", "15 minutes", "thick_cell.csv")
 def thick_cell() -> str:
     """Straight rays and multislice on the fields of a measured cell."""

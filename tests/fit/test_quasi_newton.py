@@ -123,8 +123,7 @@ def test_what_it_cannot_do_is_said():
     leaves = {name: torch.zeros(2, requires_grad=True) for name in "ab"}
     with pytest.raises(InputError, match="moves one parameter, but a, b are free"):
         QuasiNewton(leaves, same, 5, 0.0)
-    with pytest.raises(InputError, match="made no step"):
-        optimiser(LEAST).best()
+    assert optimiser(LEAST).best() is None
     with pytest.raises(InputError, match="no number"):
         steps(optimiser(LEAST), lambda x: (x * float("nan")).sum(), 1)
 

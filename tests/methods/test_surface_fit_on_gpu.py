@@ -19,13 +19,13 @@ from holosplat.beamline.simulate import simulate
 from holosplat.fit.loop import Fit
 from holosplat.fit.pose_refinement import PoseRefinement
 from holosplat.fit.problem import Schedule
-from holosplat.fit.terms.object import Neighbours, membrane_inverse, squared_product
+from holosplat.fit.terms.object import Neighbours, membrane_inverse
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.methods import Auto, SurfaceFit, Surfaces, finished
 from holosplat.methods.surface_fit import surface_fit
 from holosplat.optics.hologram import reference as plain_waves
 from holosplat.representations import SurfaceMesh
-from holosplat.representations.isosurface import adjacency, neighbour_mean
+from holosplat.representations.isosurface import adjacency
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.scene import MeshScene
 
@@ -61,22 +61,6 @@ def test_a_product_is_that_of_scipy(mesh, gpu):
     nothing = Neighbours(csr_array((4, 5)), gpu) @ x.to(gpu)
     assert nothing.shape == (4, 3)
     assert not nothing.any()
-
-
-def test_bending_and_its_gradient_are_those_of_scipy(mesh, gpu):
-    count = len(mesh.vertices)
-    away = csr_array(eye_array(count) - neighbour_mean(mesh.faces.numpy(), count))
-    pair = (csr_array(away @ away), csr_array((away @ away).T))
-    values, gradients = [], []
-    for on, matrices in (("cpu", pair), (gpu, tuple(Neighbours(one, gpu) for one in pair))):
-        leaf = mesh.vertices.to(on, copy=True).requires_grad_()
-        value = 0.7 * squared_product(leaf, *matrices)
-        value.backward()
-        assert leaf.grad is not None
-        values.append(float(value.detach()))
-        gradients.append(leaf.grad.cpu())
-    assert values[1] == pytest.approx(values[0], rel=1e-13)
-    assert relative(gradients[1], gradients[0]) < 1e-13
 
 
 @pytest.mark.parametrize("stiffness", [0.0, 0.5, 10.0, 300.0])
@@ -128,17 +112,18 @@ def test_a_fit_is_that_on_the_cpu(tiny, freed):
     ends, losses = zip(
         *(run(surface_fit(tiny, start, replace(STEPS, backend=of), freedom=freedom)) for of in ("cpu", "cuda"))
     )
-    assert losses[0][-1] < 0.9 * losses[0][0]
+    assert losses[0][-1] < losses[0][0] - 0.1
     assert losses[1] == pytest.approx(losses[0], rel=1e-4)
-    assert (ends[0] - start.vertices).abs().max() > 0.3
+    assert (ends[0] - start.vertices).abs().max() > 0.15
     assert (ends[1] - ends[0]).abs().max() < 1e-4
     assert start.vertices.device.type == "cpu"
     assert start.backend == "cpu"
 
 
 @pytest.mark.usefixtures("quick_waves")
-def test_a_step_on_the_gpu_waits_for_nothing(tiny):
-    fit = surface_fit(tiny, surfaces(bumpy(0, 3.4), unit=PITCH), replace(STEPS, backend="cuda"))
+def test_a_step_of_adam_on_the_gpu_waits_for_nothing(tiny):
+    start, free = surfaces(bumpy(0, 3.4), unit=PITCH), PoseRefinement(0.5, 0.01, 0.01, 0.02, np.zeros((3, 7)))
+    fit = surface_fit(tiny, start, replace(STEPS, backend="cuda"), freedom=free)
     work, reads = fit._work, Reads()
 
     def watched(batch):
