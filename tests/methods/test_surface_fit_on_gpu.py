@@ -11,7 +11,6 @@ import torch
 from scipy.sparse import csc_array, csr_array, diags_array, eye_array
 from scipy.sparse.linalg import splu
 from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from helpers.bumpy import bumpy, poses, surfaces
 from helpers.poses import relative
@@ -81,20 +80,6 @@ def quick_waves(gpu, monkeypatch):
         monkeypatch.setitem(sys.modules, "holosplat.optics.hologram.cuda", plain_waves)
 
 
-class Reads(TorchDispatchMode):
-    """Lists the operations that would wait for a GPU: values that come to the host, shapes that depend on them."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.found: list[str] = []
-
-    def __torch_dispatch__(self, function, types, arguments=(), keywords=None):
-        name = function.name().removeprefix("aten::").split(".")[0]
-        if name in ("_local_scalar_dense", "nonzero", "masked_select", "_unique2", "equal", "is_nonzero"):
-            self.found.append(name)
-        return function(*arguments, **(keywords or {}))
-
-
 def run(fit: Fit) -> tuple[Tensor, list[float]]:
     """The vertices that a fit ends with, in main memory, and the losses of its steps."""
     losses = list[float]()
@@ -118,24 +103,6 @@ def test_a_fit_is_that_on_the_cpu(tiny, freed):
     assert (ends[1] - ends[0]).abs().max() < 1e-4
     assert start.vertices.device.type == "cpu"
     assert start.backend == "cpu"
-
-
-@pytest.mark.usefixtures("quick_waves")
-def test_a_step_of_adam_on_the_gpu_waits_for_nothing(tiny):
-    start, free = surfaces(bumpy(0, 3.4), unit=PITCH), PoseRefinement(0.5, 0.01, 0.01, 0.02, np.zeros((3, 7)))
-    fit = surface_fit(tiny, start, replace(STEPS, backend="cuda"), freedom=free)
-    work, reads = fit._work, Reads()
-
-    def watched(batch):
-        with reads:
-            return work(batch)
-
-    fit._work = watched
-    fit.run(lambda record: None, until=1)
-    assert reads.found == []
-    with reads:
-        float(torch.ones(2).sum())
-    assert reads.found == ["_local_scalar_dense"]
 
 
 def test_a_fit_of_the_gpu_needs_no_solver_of_the_cpu(tiny, gpu, monkeypatch):
