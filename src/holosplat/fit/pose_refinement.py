@@ -136,16 +136,15 @@ def with_pose_refinement(plan: Plan, freedom: PoseRefinement | None, train: Scan
     on = model.instrument.device
     alignment = freedom.alignment(on)
     h, w = exposures.views.shape
-    if nat is None:
-        noise = float(noise_levels(train.measured).mean()) / np.ptp(train.frames)
-        nat = max(ROUNDED * noise, LEAST_LEFT) / train.frames.size
+    noise = float(noise_levels(train.measured).mean()) / float(np.ptp(train.frames))
+    weight = max(ROUNDED * noise, LEAST_LEFT) / train.frames.size if nat is None else nat
     own = {
         "alignment.shifts": RATE_PX,
         "alignment.turns": RATE_PX / (0.5 * max(h, w)),
         "alignment.stretches": RATE_SHARE * freedom.distance,
         "alignment.magnified": RATE_PX / (0.5 * max(h, w)),
     }
-    expected = GeometryPrior(freedom, nat, on)
+    expected = GeometryPrior(freedom, weight, on)
 
     def rates(factor: float, step: int) -> Mapping[str, float]:
         return {**plan.rates(factor, step), **{name: rate * factor for name, rate in own.items()}}
