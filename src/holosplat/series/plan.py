@@ -313,7 +313,6 @@ class Cut:
     """Times before its own that a task also does: a run-in, and what says how well tasks agree."""
 
     def __post_init__(self) -> None:
-        require(self.overlap >= 0, f"overlap must not be negative, but it is {self.overlap}.")
         require(self.overlap <= self.window, f"overlap must be at most the window, {self.window}, but is larger.")
 
 
@@ -344,8 +343,6 @@ class Slurm:
             value = getattr(self, name)
             fits = not value or WORD.fullmatch(value) is not None
             require(fits, f"{name} must be a word of letters, digits and -_.,:+, but it is {value!r}; correct it.")
-        require(bool(self.time), "time must be a limit such as 01:00:00, but it is empty; give one.")
-        require(self.limit >= 0, f"limit must be 0 (none) or more, but it is {self.limit}.")
 
 
 def listed(paths: Sequence[Path]) -> list[Path]:

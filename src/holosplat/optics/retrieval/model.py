@@ -11,9 +11,8 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, pad
 
 from ...backends import device, resolve
-from ...checks import at_least
 from ...progress import Advance
-from ...ranges import Weight, checked_dataclass
+from ...ranges import Natural, Weight, checked_dataclass
 from ...scan import Exposures
 from ...units import wavelength
 from ..hologram import hologram, optical_path
@@ -49,7 +48,7 @@ CROSS_TERM = 4.0
 class Regularised:
     """Options of the fits through the wave optics."""
 
-    iterations: int = 60
+    iterations: Natural = 60
     """Steps, each one evaluation of the wave optics and its gradient."""
     weight: Weight = 1.0
     """Weight of the regularisation; 1 is the Bayesian weight under the method's assumptions on the matter."""
@@ -63,7 +62,6 @@ class Regularised:
     """Expected power of the phase (default: the one that the frames show)."""
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "iterations")
         check_noise(self.noise)
 
 

@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from ...checks import at_least, finite, require, shaped
-from ...ranges import Weight, checked_dataclass
+from ...checks import finite, require, shaped
+from ...ranges import LARGEST, Within, checked_dataclass
 from ...scan import Exposures
 from ...units import wavelength, wavenumber
 from ..noise import NoiseModel, noise_levels, with_gaps
@@ -39,13 +40,10 @@ class Prior:
     Projected bodies with sharp edges fall off as f⁻³ to f⁻⁴, and are level below the frequency that their size sets.
     """
 
-    corner: Weight = 3.0
+    corner: Annotated[float, Within(0.1, LARGEST)] = 3.0
     """Frequency below which the power is level [cycles per field of view]."""
-    decay: Weight = 2.0
+    decay: Annotated[float, Within(0.1, LARGEST)] = 2.0
     """Half the exponent of the fall-off."""
-
-    def __post_init__(self) -> None:
-        at_least(self, 0.1, "corner", "decay")
 
 
 def checked(frames: Tensor | np.ndarray, exposures: Exposures, delta: float) -> Tensor:
