@@ -277,12 +277,6 @@ def part_of(noise: Noise, index: np.ndarray) -> Noise:
     return noise[index] if isinstance(noise, NoiseModel) else noise
 
 
-def check_noise(noise: Noise) -> None:
-    """`InputError` for a negative standard deviation."""
-    if isinstance(noise, float | int):
-        require(noise >= 0, f"noise must not be negative, but it is {noise}.")
-
-
 def filtered(images: Tensor, factor: Tensor) -> Tensor:
     """`images` [V, H, W] with their spectra times `factor` [V or 1, H, W//2 + 1], real; periodic."""
     return torch.fft.irfft2(torch.fft.rfft2(images) * factor, s=images.shape[-2:])

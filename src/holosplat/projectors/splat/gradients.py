@@ -14,9 +14,9 @@ from ...launch import launching
 Arrays = Sequence[Tensor]
 Poses = Sequence[Tensor | None]
 """Rotations, shifts and curvatures of views; None of what there is none."""
-Draw = Callable[[Arrays, Poses], tuple[Tensor, Arrays]]
+Draw = Callable[[Any, Any], tuple[Tensor, Arrays]]
 """From the four arrays of a cloud, contiguous, and poses: what is drawn, and what the gradients need of it."""
-Gather = Callable[[Arrays, Poses, Arrays, Tensor, bool], tuple[Arrays, Poses]]
+Gather = Callable[[Any, Any, Any, Tensor, bool], tuple[Arrays, Poses]]
 """From cloud, poses, what was kept and the gradient of what was drawn: those of the cloud, and, if wanted, of poses."""
 
 
