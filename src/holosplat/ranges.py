@@ -1,7 +1,8 @@
 """Dataclasses of options whose numbers are checked when they are made, by ranges that stand beside the fields.
 
 A number is finite, not negative and not beyond any experiment, unless its field says otherwise by one of the types
-below, such as `Signed` or `Share`, or has the value as its default. A text is not empty.
+below, such as `Signed` or `Share`, or has the value as its default. A text is not empty, and one of those of a
+`Literal`.
 """
 
 from __future__ import annotations
@@ -14,7 +15,18 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cache, wraps
 from numbers import Integral, Real
-from typing import Annotated, Any, ParamSpec, TypeVar, dataclass_transform, get_args, get_origin, get_type_hints
+from types import NoneType
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    ParamSpec,
+    TypeVar,
+    dataclass_transform,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from .checks import InputError, require
 
@@ -57,11 +69,15 @@ Angle = Annotated[float, Within(0, 180, unit="degrees")]
 Positive = Annotated[float, Within(0, LARGEST, above=True)]
 Natural = Annotated[int, Within(1, MOST)]
 """A count of at least one."""
+Several = Annotated[int, Within(2, MOST)]
+"""A count of at least two."""
 Many = Annotated[int, Within(1, 10**5)]
 """A count of views, moments, pulses or bodies simulated one by one: of more, nothing could be said for minutes."""
 ManyOrNone = Annotated[int, Within(0, 10**5)]
 Jobs = Annotated[int, Within(1, 1000)]
 """Processes of a machine."""
+Degree = Annotated[int, Within(1, 5)]
+"""Degrees of polynomials of time."""
 Share = Annotated[float, Within(0, 1)]
 SomeShare = Annotated[float, Within(0, 1, above=True)]
 Weight = Annotated[float, Within(0, 1e6)]
@@ -204,6 +220,9 @@ def _require_sound(name: str, value: Any, default: Any, hint: Any) -> None:
     if value is default or (isinstance(value, type(default)) and isinstance(value, Real | str) and value == default):
         return
     require(value != "" if isinstance(value, str) else True, f"{name} must not be empty; leave it out instead.")
+    if (names := _names(hint)) and value not in names:
+        known = ", ".join(str(one) for one in names if one is not None)
+        raise InputError(f"{name} must be one of {known}, but it is {value!r}; correct it.")
     for number in _numbers(value):
         wanted = range_of(hint, number)
         if fault := wanted.fault(number):
@@ -226,6 +245,15 @@ def _declared(hint: Any) -> Iterator[Within]:
         yield from (one for one in hint.__metadata__ if isinstance(one, Within))
     for inner in get_args(hint):
         yield from _declared(inner)
+
+
+def _names(hint: Any) -> tuple[Any, ...]:
+    """The values of a `Literal`, which may be None beside it; nothing of another type."""
+    inner = [one for one in get_args(hint) if one is not NoneType]
+    if get_origin(hint) is Literal:
+        return get_args(hint)
+    alone = len(inner) == 1 and len(get_args(hint)) == 2 and get_origin(inner[0]) is Literal
+    return (*get_args(inner[0]), None) if alone else ()
 
 
 def _takes_floats(hint: Any) -> bool:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar, Literal, Protocol
+from typing import Annotated, ClassVar, Literal, Protocol
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from holosplat.ranges import (
     Positive,
     Signed,
     Small,
+    Within,
     checked_dataclass,
 )
 from holosplat.scan import Exposures, Scan
@@ -94,15 +95,10 @@ class Beam:
 class Detector:
     """rows, columns: pixels; pixel_size: effective pitch [m]; psf_sigma_px: of its point-spread function [pixels]."""
 
-    rows: int
-    columns: int
+    rows: Annotated[int, Within(1, MOST_PIXELS)]
+    columns: Annotated[int, Within(1, MOST_PIXELS)]
     pixel_size: Small
     psf_sigma_px: Pixels = 0.0
-
-    def __post_init__(self) -> None:
-        for name in ("rows", "columns"):
-            count = getattr(self, name)
-            require(1 <= count <= MOST_PIXELS, f"{name} must lie between 1 and {MOST_PIXELS}, but it is {count}.")
 
 
 class Directions(Protocol):

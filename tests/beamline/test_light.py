@@ -111,12 +111,12 @@ def test_simulations_take_light_last():
 @pytest.mark.parametrize(
     ("options", "match"),
     [
-        ({"light_flux": 0.0}, "light_flux must lie between 0.01 and 100"),
-        ({"light_smooth": 0.5}, "light_smooth must lie between 0 and 0.2"),
-        ({"light_grain": -0.1}, "light_grain must lie between 0 and 0.2"),
+        ({"light_flux": 0.0}, "light_flux must be at least 0.01"),
+        ({"light_smooth": 0.5}, "light_smooth must be at most 0.2"),
+        ({"light_grain": -0.1}, "light_grain must not be negative"),
         ({"light_grain_px": 0.1}, "light_grain_px must be at least 0.3"),
         ({"light_drift_px": 3.0}, "light_drift_px moves the pattern, of which there is none"),
-        ({"light_pattern": 0.1, "light_drift_px": 1e5}, "light_drift_px must be within 10 000"),
+        ({"light_pattern": 0.1, "light_drift_px": 1e5}, "light_drift_px must be at most 10000"),
         ({"light_seed": -1}, "light_seed must not be negative"),
     ],
 )

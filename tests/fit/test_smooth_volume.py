@@ -107,7 +107,7 @@ def test_a_known_level_draws_matter_that_is_near_to_it():
 
 
 def test_bad_options_are_refused():
-    with pytest.raises(InputError, match="slope must be positive"):
+    with pytest.raises(InputError, match="slope must be a positive number"):
         ContinuousPrior(slope=0.0)
     with pytest.raises(InputError, match="values must"):
         ContinuousPrior(values=-1.0)

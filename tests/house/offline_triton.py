@@ -100,10 +100,10 @@ def operations(every_size: bool) -> list[Callable[[], None]]:
         curvatures = torch.full((1,), 0.01, dtype=torch.float64) if cone else None
         poses = (torch.eye(3, dtype=torch.float64)[None], torch.zeros(1, 2, dtype=torch.float64), curvatures)
         poses[0].requires_grad_(of_poses)
-        splats.splat(*cloud(channels), *poses, (8, 9), 4.0, 1 / 12).sum().backward()
+        splats.splat(cloud(channels), poses, (8, 9), 4.0, 1 / 12).sum().backward()
 
     def voxelise(channels: int) -> None:
-        splats.voxelise(*cloud(channels), (8, 9, 10), 4.0, 1 / 12).sum().backward()
+        splats.voxelise(cloud(channels), (8, 9, 10), 4.0, 1 / 12).sum().backward()
 
     def compare() -> None:
         frames = torch.ones(1, 20, 30)

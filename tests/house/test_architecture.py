@@ -64,13 +64,6 @@ MOST_LINES = 400
 EXAMPLES = re.compile(r"\n *Examples:\n\n(?: +(?:>>>|\.\.\.) .*\n| +[^\s\"].*\n)+")
 """The last section of a docstring."""
 MOST_ARGUMENTS = 7
-MANY_ARGUMENTS = {
-    "projectors/splat/cpu.py:splat": "all arguments of the package's splat, checked, by position",
-    "projectors/splat/cuda.py:splat": "all arguments of the package's splat, checked, by position",
-    "projectors/splat/reference.py:splat": "all arguments of the package's splat, checked, by position",
-}
-"""Public functions with more arguments by position, each with its reason."""
-
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 SOURCE = Path(__file__).resolve().parents[2] / "src"
@@ -254,7 +247,7 @@ def arguments_are_few(files: Files) -> list[str]:
             complaints.append(f"{name} takes **{node.args.kwarg.arg}")
         static = any(isinstance(d, ast.Name) and d.id == "staticmethod" for d in node.decorator_list)
         count = len(node.args.posonlyargs) + len(node.args.args) - (method and not static)
-        if count > MOST_ARGUMENTS and name not in MANY_ARGUMENTS:
+        if count > MOST_ARGUMENTS:
             complaints.append(f"{name} takes {count} arguments by position")
     return complaints
 
@@ -302,8 +295,6 @@ def test_the_pages_name_the_tiers(files):
 
 def test_the_exceptions_are_still_needed(files):
     """An exception that nothing uses any more is taken off the list."""
-    many = {name for name, node, _ in _public(files) if isinstance(node, Function)}
-    assert set(MANY_ARGUMENTS) <= many
     assert all(path in files for path in BACKEND_IMPORTS)
 
 

@@ -41,6 +41,7 @@ NEEDED: dict[str, dict[str, Any]] = {
     "CrowdedCells": {"haematocrit": 0.2, "diameter": 8e-6, "box": (1e-4, 1e-4, 1e-4)},
     "Detector": {"rows": 5, "columns": 13, "pixel_size": 1e-6},
     "ExtraTerm": {"name": "light_prior"},
+    "FixedPatternOptions": {"order": 4},
     "FoamDrop": {"drop": 1e-4, "count": 5, "median": 1e-5},
     "GivenOptics": {"energy_kev": 20.0, "distance": 0.1, "pixel_size": 1e-6},
     "Interleaved": {"count": 8},

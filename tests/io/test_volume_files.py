@@ -57,5 +57,5 @@ def test_what_cannot_be_is_refused(tmp_path):
     ):
         with pytest.raises(InputError, match=match):
             read_specimen([tmp_path / name for name in names], meaning)
-    with pytest.raises(InputError, match="voxel_size must lie between"):
+    with pytest.raises(InputError, match="voxel_size must be at most"):
         StackMeaning(2.0, DeltaBeta(1e-8, 0))

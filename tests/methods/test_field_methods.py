@@ -177,9 +177,9 @@ def test_interrupts_pass():
     [
         (lambda: VoxelFit(steps=0), "steps must be at least 1"),
         (lambda: VoxelFit(weight=-1.0), "weight must not be negative"),
-        (lambda: VoxelFit(smoothing=0.0), "smoothing must be positive"),
+        (lambda: VoxelFit(smoothing=0.0), "smoothing must be a positive number"),
         (lambda: VoxelFit(schedule=Schedule(views_per_step=2)), "voxels need views_per_step = 0"),
-        (lambda: NeuralFit(rate=0.0), "rate must be positive"),
+        (lambda: NeuralFit(rate=0.0), "rate must be a positive number"),
         (lambda: NeuralFit(warmup_steps=0, schedule=Schedule(steps=0)), "a fit needs steps"),
         (lambda: fit_neural(scan(count=2), ONE, torch.zeros(2, 9, 9), NeuralFit(), 0), "thickness must have the shape"),
     ],

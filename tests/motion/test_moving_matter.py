@@ -166,5 +166,5 @@ def test_turns_have_no_strain_and_shears_do():
 
 
 def test_options_that_cannot_be_are_refused():
-    with pytest.raises(InputError, match="strain must be above zero"):
+    with pytest.raises(InputError, match="strain must be a positive number"):
         FlowOptions(strain=0.0)

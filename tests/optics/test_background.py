@@ -193,7 +193,7 @@ def test_light_given_by_boxes_and_in_vain():
     found = Light.of(frames, LightOptions("smooth", ((0, 40, 0, 12),)))
     assert found.background is not None
     assert found.background.factor()[:, :, :12].numpy() == pytest.approx(1.05, abs=0.002)
-    with pytest.raises(InputError, match="light must be"):
+    with pytest.raises(InputError, match="kind must be one of auto, even, smooth"):
         LightOptions("dim")  # type: ignore[arg-type]
 
 

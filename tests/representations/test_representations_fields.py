@@ -335,7 +335,7 @@ CUBE = Grid.centred((3, 3, 3), 1.0)
         (lambda: Encoding("wavelet"), "kind must be one of hash, fourier, octaves"),  # type: ignore[arg-type]
         (lambda: Encoding(levels=0), "levels must be at least 1"),
         (lambda: Encoding(coarsest=1.0, finest=2.0), "finest must lie between"),
-        (lambda: Encoding(bandwidth=0.0), "bandwidth must be positive"),
+        (lambda: Encoding(bandwidth=0.0), "bandwidth must be a positive number"),
         (lambda: Network(hidden=0), "hidden must be at least 1"),
         (lambda: Matter(()), "matter must have a channel at least, but it has none"),
         (lambda: Matter(((1.0, 0.0),) * 3, occupancies=False), "have a channel each, but matter has 3"),  # type: ignore[arg-type]

@@ -204,8 +204,8 @@ def test_the_head_phantom_has_its_levels():
 @pytest.mark.parametrize(
     ("make", "match"),
     [
-        (lambda: Soft(2.5), "width of an edge must lie between 0 and 2"),
-        (lambda: Bump(0), "power of a bump must lie between 1 and 20"),
+        (lambda: Soft(2.5), "width must be at most 2"),
+        (lambda: Bump(0), "power must be at least 1"),
         (lambda: ContinuousScene(()), "at least one element"),
         (lambda: ellipsoid((0, 0), (1e-6,) * 3, Soft(), MATTER), "centre of an element must have the shape"),
         (lambda: ellipsoid((0, 0, 0), (1e-6, 1e-6, 0), Soft(), MATTER), "semi-axis of an element"),

@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import Annotated
 
 import numpy as np
 
 from ..baselines.material import LIKELY_RATIOS
-from ..checks import InputError, at_least, in_range, require
+from ..checks import InputError, require
 from ..frames import evenly
 from ..geometry import rotation_y
 from ..inference import Compared, Decision, Score, select
@@ -18,7 +19,7 @@ from ..methods.cross_validation import PICTURE_VIEWS, FirstVolumes, Folds, coars
 from ..methods.trials import NULL, WITHOUT, Trials
 from ..optics.background import LightOptions
 from ..progress import Advance
-from ..ranges import checked_dataclass
+from ..ranges import MOST, Natural, Within, checked_dataclass
 from ..rotations import angles_about_y
 from ..scan import Exposures, Scan
 from .consistency import (
@@ -52,20 +53,14 @@ FEWEST_VIEWS = 6
 class AxisOptions:
     """How the axis of a turning object is looked for."""
 
-    within: float = 0.3
+    within: Annotated[float, Within(0.01, 0.5)] = 0.3
     """How far from where the scan says it is, as a share of the frames' width."""
-    bands: int = 16
+    bands: Natural = 16
     """Rows are averaged to so many slices at most: enough for a lean, and neighbouring rows differ little."""
-    columns: int = 512
+    columns: Annotated[int, Within(32, MOST)] = 512
     """Columns are averaged to so many at most; the place is found to some hundredths of one."""
-    views: int = 256
+    views: Annotated[int, Within(FEWEST_VIEWS, MOST)] = 256
     """Views that are looked at, at most, evenly spread: more add little and take time."""
-
-    def __post_init__(self) -> None:
-        in_range("within", self.within, 0.01, 0.5)
-        at_least(self, 1, "bands")
-        at_least(self, 32, "columns")
-        at_least(self, FEWEST_VIEWS, "views")
 
 
 @dataclass(frozen=True)

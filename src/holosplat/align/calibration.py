@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 import torch
 
-from ..checks import InputError, at_least, in_range, require
+from ..checks import InputError, require
 from ..geometry import Views
 from ..matter import Known, MaterialPrior
 from ..mesh import TriangleMesh
@@ -16,12 +17,12 @@ from ..optics.background import LightOptions
 from ..optics.retrieval import paganin
 from ..optics.sampling import fringe_sampling
 from ..progress import Progress
-from ..ranges import Pixels, checked_dataclass
+from ..ranges import MOST, Natural, Within, checked_dataclass
 from ..scan import Exposures, Scan
 from .derivatives import NUMBERS, changes, header, line, moved_onto, rms_of, unexplained
 from .initial_geometry import retrieved, shifts_by_mass
 from .phantom import STEPS, Linear, Phantom, find_beads, linearised, placed, solved
-from .poses import DISTANCE, FLUX, SHIFT, TURN, PosePrior, aligned
+from .poses import DISTANCE, FLUX, SHIFT, TURN, Blur, PosePrior, aligned
 from .views import EVEN_OR_NOT, KINDS, in_even_light
 
 UNTOLD = 0.5
@@ -45,28 +46,24 @@ class CalibrationOptions:
 
     uncertain: PosePrior = field(default_factory=lambda: PosePrior(5.0, 2.0, 2.0, 0.05))
     """What is not known of each view, and by how much."""
-    pixel: float = 0.0
+    pixel: Annotated[float, Within(0, 0.2)] = 0.0
     """Standard deviation of the pixel size, as a share of it (0: it is known)."""
-    rounds: int = 8
+    rounds: Natural = 8
     """Gauss–Newton steps on each size of pixels, at most."""
-    blur: Pixels = 1.0
+    blur: Blur = 1.0
     """Frames are compared after a Gaussian of this standard deviation [pixels]."""
-    least_side: int = 24
+    least_side: Annotated[int, Within(8, MOST)] = 24
     """Pixels along a frame's shorter side on the largest pixels, on which a first pose is looked for."""
-    most_pixels: int = 400_000
+    most_pixels: Natural = 400_000
     """Pixels of all frames, on the smallest pixels: larger frames are binned, and shifts found to a part of that."""
 
     retrieval: int = 20
     """Steps of the phase retrieval that a first place needs; 0: Paganin's filter, which will do without noise."""
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "rounds", "most_pixels")
-        at_least(self, 8, "least_side")
         require(
             self.uncertain.magnification == 0, "calibrate finds one pixel size of all views; leave magnification 0."
         )
-        require(self.pixel <= 0.2, f"uncertain pixel size must be 0.2 at most, but it is {self.pixel:g}; correct it.")
-        in_range("blur", self.blur, 0.3, 10.0, unit="pixels")
 
     def bins(self, count: int, shape: tuple[int, int]) -> list[int]:
         """Sizes of pixels, the largest first."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import InputError, require, shaped
+from ..checks import as_written, require, shaped
 from ..scan import Scan
 from .poses import PosePrior
 from .views import AlignedViews
@@ -113,12 +113,10 @@ class Geometry:
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Geometry:
         """The geometry of `as_dict`; `InputError` for anything else."""
-        try:
+        with as_written("the geometry of a run", "what reconstruct wrote"):
             read: dict[str, Any] = {each.name: values[each.name] for each in fields(cls)}
             read |= {name: tuple(values[name]) for name in TEXTS}
             return cls(**read)
-        except (KeyError, TypeError, ValueError) as error:
-            raise InputError(f"the geometry of a run must be what reconstruct wrote, but {error} is amiss.") from None
 
     def lines(self) -> list[str]:
         """The result in two sentences, and what stayed as planned."""

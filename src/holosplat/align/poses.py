@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from ..baselines.primal_dual import PrimalDual
-from ..checks import at_least, in_range, require
+from ..checks import require
 from ..fit.pose_refinement import PoseRefinement
 from ..geometry import Grid
 from ..matter import DeltaBeta
@@ -19,13 +20,15 @@ from ..model import Alignment
 from ..optics.sampling import fringe_sampling
 from ..progress import Advance
 from ..projectors.voxels import LatticeProjector
-from ..ranges import Angle, Pixels, Weight, checked_dataclass
+from ..ranges import MOST, Angle, Natural, Pixels, Weight, Within, checked_dataclass
 from ..scan import Exposures, Scan
 from .derivatives import NUMBERS, Normal, in_pixels, predicted, step, unexplained
 from .initial_geometry import retrieved, shifts_by_mass
 
 SHIFT, TURN, DISTANCE, MAGNIFICATION, FLUX = slice(0, 2), slice(2, 5), 5, 6, 7
 """Places of the numbers of `NUMBERS`."""
+Blur = Annotated[float, Within(0.3, 10, unit="pixels")]
+"""Widths of a Gaussian on a raster, which its samples show [pixels]."""
 
 
 def aligned(numbers: Tensor, pixels: float = 1.0) -> Alignment:
@@ -120,40 +123,35 @@ class PoseOptions:
 
     uncertain: PosePrior = field(default_factory=PosePrior)
     """What is not known, and by how much."""
-    rounds: int = 8
+    rounds: Natural = 8
     """Rounds of volume and poses on each size of pixels, at most."""
-    least_side: int = 16
+    least_side: Annotated[int, Within(4, MOST)] = 16
     """Pixels along a frame's shorter side on the largest pixels, which catch the largest errors."""
-    max_voxels: int = 4_000_000
+    max_voxels: Natural = 4_000_000
     """Pixels are not smaller than allow so many voxels; shifts are found to some hundredths of such a pixel."""
-    blur: Pixels = 1.0
+    blur: Blur = 1.0
     """Frames are compared after a Gaussian of this standard deviation [pixels]: details of a pixel's size depend on
     the voxels' raster."""
     weight: Weight = 0.5
     """Weight of total variation in the volume [pixels of path length]."""
-    steps: int = 8
+    steps: Natural = 8
     """Primal–dual steps of the volume a round, for `few_views` or more."""
-    first: int = 40
+    first: Natural = 40
     """Steps of the first volume, likewise."""
-    few_views: int = 10
+    few_views: Natural = 10
     """With fewer training views than this there are more steps: total variation has more to fill in, and where it has
     not, a volume takes any pose."""
     by_mass: Weight = 2.0
     """Uncertain shifts [pixels] beyond which centres of mass give the first ones: they are good to a pixel or two."""
-    retrieval: int = 40
+    retrieval: Natural = 40
     """Steps of the phase retrieval."""
-    times: int = 8
+    times: Natural = 8
     """Times of a series that are used at most: those that say most, evenly spread."""
     drift: Drift = field(default_factory=Drift)
     """How far the beams of a series may drift."""
     edges: int = 60
     """Steps of surfaces with the geometry free, after the voxels, where matter has one known density: poses of cells
     settle in fifty (0: none)."""
-
-    def __post_init__(self) -> None:
-        at_least(self, 1, "rounds", "max_voxels", "steps", "first", "retrieval", "few_views", "times")
-        at_least(self, 4, "least_side")
-        in_range("blur", self.blur, 0.3, 10.0, unit="pixels")
 
     def levels(self, shape: tuple[int, int], views: int) -> tuple[Level, ...]:
         """From the largest pixels to the smallest, by powers of two, of frames of this shape.

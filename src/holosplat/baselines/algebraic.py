@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..checks import at_least, require
+from ..checks import require
 from ..geometry import Grid, Views
 from ..memory import memory_kept
 from ..progress import Advance
 from ..projectors.voxels import Projector, SliceProjector, projector_for
-from ..ranges import checked_dataclass
+from ..ranges import Natural, SomeShare, checked_dataclass
 from ..rotations import angles_about_y
 from .rays import Rays, bounded, checked_upper, in_pixels, rays_of
 
@@ -28,11 +28,8 @@ class Ramp:
     """
 
     window: Literal["ramlak", "shepp-logan", "hann"] = "hann"
-    cutoff: float = 1.0
+    cutoff: SomeShare = 1.0
     nonnegative: bool = False
-
-    def __post_init__(self) -> None:
-        require(0 < self.cutoff <= 1, f"cutoff must lie between 0 and 1, but it is {self.cutoff:g}.")
 
 
 def filtered_backprojection(
@@ -150,12 +147,11 @@ class Algebraic:
     relaxation: length of a step, between 0 and 2; nonnegative: whether the occupancy is kept from going below zero.
     """
 
-    sweeps: int = 60
+    sweeps: Natural = 60
     relaxation: float = 1.0
     nonnegative: bool = False
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "sweeps")
         require(0 < self.relaxation < 2, f"relaxation must lie between 0 and 2, but it is {self.relaxation:g}.")
 
 

@@ -17,7 +17,6 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from ..backends import Backend, device, resolve
-from ..checks import at_least
 from ..geometry import Grid, Views
 from ..matter import DeltaBeta
 from ..memory import memory_kept
@@ -30,7 +29,7 @@ from ..optics.retrieval.spectra import Raster, filtered, radian, response, spect
 from ..optics.sampling import fringe_sampling
 from ..progress import Progress
 from ..projectors.voxels import projector_for
-from ..ranges import Metres, Weight, checked_dataclass
+from ..ranges import Metres, Natural, Weight, checked_dataclass
 from ..scan import Scan
 from .beyond import Margins, carried_on, columns_beyond, rows_beyond, unseen_rays
 from .primal_dual import PrimalDual
@@ -53,9 +52,9 @@ def _always(volume: Tensor, grid: Grid) -> bool:
 class HolographicTV:
     """Options of the start: phase retrieval, total variation, and agreement with the holograms."""
 
-    retrieval: int = 60
+    retrieval: Natural = 60
     """Steps of the phase retrieval."""
-    iterations: int = 160
+    iterations: Natural = 160
     """Primal–dual steps on the retrieved thickness."""
     weight: Weight = 0.3
     """Weight of total variation while the volume is made to agree with the holograms, in pixels of path length."""
@@ -73,7 +72,7 @@ class HolographicTV:
     """Share of the frames' contrast that is noise from which on there are no rounds: the volume would agree with it."""
     refine: int = 0
     """Voxels along a pixel's edge in the rounds (0: as the first fringe needs)."""
-    max_voxels: int = 70_000_000
+    max_voxels: Natural = 70_000_000
     """Coarser voxels rather than more than this many."""
     upper: Weight = 1.0
     """Bound of the occupancy (0: none)."""
@@ -99,9 +98,6 @@ class HolographicTV:
     not say how much lies inside, and its error may grow."""
     backend: Backend = "auto"
     """What computes it."""
-
-    def __post_init__(self) -> None:
-        at_least(self, 1, "retrieval", "iterations", "max_voxels")
 
     def in_noise(self) -> HolographicTV:
         """The same with rounds of agreement in noise, too: twice as many, and a weight of total variation beside which

@@ -7,12 +7,12 @@ import torch
 from torch import Tensor
 
 from ..backends import Backend, resolve
-from ..checks import at_least, require
+from ..checks import require
 from ..geometry import Grid
 from ..memory import memory_kept
 from ..optics.retrieval import paganin
 from ..progress import Progress
-from ..ranges import Weight, checked_dataclass
+from ..ranges import Natural, Weight, checked_dataclass
 from ..scan import Scan
 from .rays import rays_of
 from .tomography import TotalVariation, plateau, tv_solver
@@ -31,15 +31,12 @@ TRIAL_DELTA = 1e-6
 class MaterialEstimate:
     """How δ of a material that is not known is estimated from the frames."""
 
-    width: int = 128
+    width: Natural = 128
     """Frames are binned to about so many pixels."""
     weight: Weight = 0.1
     """Weight of total variation in the trial volumes, in pixels of path length."""
-    iterations: int = 40
+    iterations: Natural = 40
     """Primal–dual steps for a trial volume."""
-
-    def __post_init__(self) -> None:
-        at_least(self, 1, "width", "iterations")
 
 
 DEFAULT = MaterialEstimate()

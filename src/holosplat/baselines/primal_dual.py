@@ -2,43 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
 from ..backends import implementation
-
-
-class LinearProjector(Protocol):
-    """A linear map from volumes to line integrals, and its adjoint, on arrays in an order of its own choice."""
-
-    array_shape: tuple[int, int, int]
-
-    def project(self, array: Tensor, /) -> Tensor:
-        """Volume → line integrals."""
-        ...
-
-    def backproject(self, lines: Tensor, /) -> Tensor:
-        """The adjoint: line integrals → volume."""
-        ...
-
-    def volume_in(self, volume: Tensor, /) -> Tensor:
-        """[Z, Y, X] → the projector's order."""
-        ...
-
-    def volume_out(self, array: Tensor, /) -> Tensor:
-        """The projector's order → [Z, Y, X]."""
-        ...
-
-    def lines_in(self, images: Tensor, /) -> Tensor:
-        """[V, H, W] → the projector's order."""
-        ...
-
-    def lines_out(self, lines: Tensor, /) -> Tensor:
-        """The projector's order → [V, H, W]."""
-        ...
+from ..projectors.voxels import Projector
 
 
 class PrimalDual:
@@ -52,7 +21,7 @@ class PrimalDual:
 
     def __init__(
         self,
-        projector: LinearProjector,
+        projector: Projector,
         start: Tensor,
         weight: float,
         upper: float | None,
@@ -86,7 +55,7 @@ class PrimalDual:
         """Line integrals [V, H, W] of the volume as it is now."""
         return self.projector.lines_out(self.projector.project(self._array))
 
-    def on_finer(self, projector: LinearProjector, factor: int, weight: float) -> PrimalDual:
+    def on_finer(self, projector: Projector, factor: int, weight: float) -> PrimalDual:
         """A solver on voxels and pixels `factor` times finer, those of `projector`, which goes on from this one.
 
         It takes over the volume (interpolated), the bounds, and the dual of total variation, without which its first

@@ -21,13 +21,12 @@ from torch import Tensor
 from torch.nn.functional import avg_pool3d
 
 from ..backends import Backend
-from ..checks import at_least
 from ..geometry import Grid
 from ..matter import LEAST_CONTRAST, DeltaBeta
 from ..model import Instrument
 from ..optics.sampling import fringe_sampling
 from ..projectors.voxels import voxel_line_integrals
-from ..ranges import Pixels, Share, Weight, checked_dataclass
+from ..ranges import Natural, Pixels, Share, Weight, checked_dataclass
 from ..representations.voxels import VoxelLines
 from ..scan import Scan
 from ..units import wavelength
@@ -42,7 +41,7 @@ STEP, ITERATIONS = 1e-10, 5
 class TwoMaterials:
     """How two materials are told apart."""
 
-    rounds: int = 2
+    rounds: Natural = 2
     """Rounds in which the frames are turned into those of one ratio; with more, the materials drift."""
     faint: Share = 0.3
     """Below this share of the level that most matter has, there are halos rather than matter."""
@@ -56,9 +55,6 @@ class TwoMaterials:
     """Occupancies below this are noise."""
     blur: Pixels = 1.5
     """Standard deviation of the blur of frames in which absorption is looked for, in widths √(λz) of a fringe."""
-
-    def __post_init__(self) -> None:
-        at_least(self, 1, "rounds")
 
 
 DEFAULT = TwoMaterials()

@@ -9,14 +9,18 @@ arrives, and the division by the flat comes after.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Annotated
 
 import numpy as np
 
-from ..checks import at_least, require
-from ..ranges import Pixels, Seed, Signed, checked_dataclass
+from ..checks import require
+from ..ranges import Seed, Within, checked_dataclass
 
 MOST_RMS = 0.2
 """Largest relative deviation of light (rms): beyond, one in a million pixels would have to be dark."""
+Uneven = Annotated[float, Within(0, MOST_RMS)]
+Grain = Annotated[float, Within(0.3, 1e4, unit="pixels")]
+"""Correlation lengths [pixels]."""
 FAINTEST = 0.01
 """No pixel gets less than this share of the light."""
 
@@ -25,40 +29,30 @@ FAINTEST = 0.01
 class UnevenLight:
     """How light differs from the flat field; by default not at all. Errors: `InputError` for values out of range."""
 
-    light_flux: float = 1.0
+    light_flux: Annotated[float, Within(0.01, 100)] = 1.0
     """Mean intensity of the air, relative to the flat."""
-    light_offset: float = 0.0
+    light_offset: Uneven = 0.0
     """Relative deviation (rms) of each frame's own intensity from that."""
-    light_slope: float = 0.0
+    light_slope: Uneven = 0.0
     """Relative change (rms) of each frame's intensity from its middle to an edge, along rows and along columns."""
-    light_smooth: float = 0.0
+    light_smooth: Uneven = 0.0
     """Relative deviation (rms) of a smooth random background, another in each frame."""
-    light_smooth_px: Pixels = 30.0
+    light_smooth_px: Grain = 30.0
     """Correlation length of the smooth background [pixels]: its correlation is exp(-r² / 2 length²)."""
-    light_grain: float = 0.0
+    light_grain: Uneven = 0.0
     """Relative deviation (rms) of correlated grain, another in each frame."""
-    light_grain_px: Pixels = 1.5
+    light_grain_px: Grain = 1.5
     """Correlation length of the grain [pixels]."""
-    light_pattern: float = 0.0
+    light_pattern: Uneven = 0.0
     """Relative deviation (rms) of the pattern that all frames and the flat share."""
-    light_pattern_px: Pixels = 15.0
+    light_pattern_px: Grain = 15.0
     """Correlation length of the pattern [pixels]."""
-    light_drift_px: Signed = 0.0
+    light_drift_px: Annotated[float, Within(-1e4, 1e4)] = 0.0
     """How far the pattern moves sideways, along rows, from the flat and the first frame to the last [pixels]."""
     light_seed: Seed = 0
     """Seed of the light."""
 
     def __post_init__(self) -> None:
-        require(
-            0.01 <= self.light_flux <= 100, f"light_flux must lie between 0.01 and 100, but it is {self.light_flux}."
-        )
-        for name in ("light_offset", "light_slope", "light_smooth", "light_grain", "light_pattern"):
-            value = getattr(self, name)
-            require(0 <= value <= MOST_RMS, f"{name} must lie between 0 and {MOST_RMS:g}, but it is {value:g}.")
-        at_least(self, 0.3, "light_smooth_px", "light_grain_px", "light_pattern_px")
-        require(
-            abs(self.light_drift_px) <= 1e4, f"light_drift_px must be within 10 000, but it is {self.light_drift_px}."
-        )
         require(
             self.light_drift_px == 0 or self.light_pattern > 0,
             "light_drift_px moves the pattern, of which there is none; give light_pattern, too.",

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
-from ..checks import at_least, in_range, require
+from ..checks import require
 from ..io.atomic import require_apart, require_writable
 from ..io.formats import loader_of, read
 from ..io.hdf5 import new_hdf5, put
@@ -20,7 +21,7 @@ from ..optics.coherence import joined_blur_px
 from ..optics.noise import PHOTON_RANGE
 from ..optics.resampling import FLIPS, Flip
 from ..progress import Advance
-from ..ranges import Many, Photons, Seed, checked_dataclass
+from ..ranges import Many, Seed, Within, checked_dataclass
 from ..scan import Exposures, Scan
 
 DEAD_BIT, HOT_BIT = 1 << 1, 1 << 3
@@ -31,7 +32,7 @@ DEAD_BIT, HOT_BIT = 1 << 1, 1 << 3
 class RecordingOptions:
     """Options of a recording."""
 
-    photons_per_pixel: Photons = 10_000.0
+    photons_per_pixel: Annotated[float, Within(*PHOTON_RANGE)] = 10_000.0
     """Mean photons detected in a pixel without the object."""
     flats: Many = 100
     """Frames without the object, each of a pulse of its own; they come before the projections."""
@@ -41,11 +42,6 @@ class RecordingOptions:
     """The order that the detector reverses: of its rows, of its columns, or of both."""
     seed: Seed = 0
     """Seed of everything random."""
-
-    def __post_init__(self) -> None:
-        in_range("photons_per_pixel", self.photons_per_pixel, *PHOTON_RANGE)
-        at_least(self, 1, "flats", "darks")
-        require(self.flip in FLIPS, f"flip must be one of {', '.join(FLIPS)}, but it is {self.flip!r}.")
 
 
 @dataclass(frozen=True)

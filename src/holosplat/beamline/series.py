@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
-from ..checks import in_range, require
+from ..checks import require
 from ..io.paraview import find_snapshots
 from ..progress import Advance
-from ..ranges import Frequency, Seconds, Signed, Weight, checked_dataclass
+from ..ranges import Seconds, Signed, Weight, Within, checked_dataclass
 from ..specimens.scene import ROUNDING, MeshSeries
 from ..units import LENGTH_UNITS, unit_factor
 from .simulate import Filling, Shutter, field_centre, filled_scene
@@ -28,23 +28,14 @@ class Timing:
     Errors: `InputError` for a rate or count out of range, or a start below 0.
     """
 
-    frame_rate: Frequency
+    frame_rate: Annotated[float, Within(*FRAME_RATE_RANGE, unit="Hz")]
     """Frames a second [Hz]."""
-    frames: int | None = None
+    frames: Annotated[int, Within(1, MOST_TIMES)] | None = None
     """Number of times (default: as many as the snapshots cover)."""
     start: Seconds | None = None
     """Time of the first frame after the first snapshot [s] (default: the earliest whose pulses all fit)."""
     shutter: Shutter = field(default_factory=Shutter)
     """Motion blur about each time (default: none)."""
-
-    def __post_init__(self) -> None:
-        in_range("frame rate", self.frame_rate, *FRAME_RATE_RANGE, unit="Hz")
-        if self.frames is not None:
-            require(
-                1 <= self.frames <= MOST_TIMES, f"frames must lie between 1 and {MOST_TIMES}, but it is {self.frames}."
-            )
-        early = self.start is not None and not (np.isfinite(self.start) and self.start >= 0)
-        require(not early, f"start must be 0 seconds or more after the first snapshot, but it is {self.start}.")
 
     def times(self, length: float) -> np.ndarray:
         """Times [T] of the frames [s] after the first of snapshots that last `length` [s]; `InputError` if too few."""

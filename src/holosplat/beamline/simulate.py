@@ -3,16 +3,16 @@ energy or of a spectrum."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
 
 from ..backends import Backend, device, resolve
-from ..checks import InputError, in_range, require, require_regular
+from ..checks import InputError, require, require_regular
 from ..geometry import Grid, Views
 from ..io.vtk import read_meshes
 from ..materials import HAEMOGLOBIN, DeltaBeta, Material, Transparent, material_of
@@ -23,7 +23,7 @@ from ..optics.noise import PHOTON_RANGE
 from ..optics.propagation import poisson
 from ..optics.sampling import resolving_oversample
 from ..progress import Advance
-from ..ranges import Many, Photons, Seed, checked_dataclass
+from ..ranges import Seconds, Seed, Within, checked_dataclass
 from ..scan import Exposures, Scan, interleaved_split
 from ..specimens.repair import closed
 from ..specimens.scene import MeshScene, MeshSeries
@@ -45,19 +45,12 @@ class Shutter:
     Errors: `InputError` for a negative length, and for one without the other.
     """
 
-    exposure: float = 0.0
+    exposure: Seconds = 0.0
     """Length of the exposure about the frame's time [s] (default: 0, no motion blur)."""
-    pulses: Many = 1
+    pulses: Annotated[int, Within(1, MOST_PULSES)] = 1
     """Number of flashes, each in the middle of an equal part of the exposure; a steady beam has many."""
 
     def __post_init__(self) -> None:
-        require(
-            math.isfinite(self.exposure) and self.exposure >= 0,
-            f"exposure must be 0 seconds or more, but it is {self.exposure:g}; correct it.",
-        )
-        require(
-            1 <= self.pulses <= MOST_PULSES, f"pulses must lie between 1 and {MOST_PULSES}, but it is {self.pulses}."
-        )
         require(
             (self.exposure > 0) == (self.pulses > 1),
             f"motion blur needs both an exposure above 0 s and at least 2 pulses, but they are {self.exposure:g} s and "
@@ -77,7 +70,7 @@ class Simulation:
     Errors: `InputError` for photons or a seed out of range.
     """
 
-    photons_per_pixel: Photons | None = None
+    photons_per_pixel: Annotated[float, Within(*PHOTON_RANGE)] | None = None
     """Mean counts of the Poisson noise (default: no noise)."""
     seed: Seed = 0
     """Seed of the noise."""
@@ -89,10 +82,6 @@ class Simulation:
     """How the light differs from the flat field (default: not at all)."""
     backend: Backend = "cpu"
     """Where waves, and rays through meshes, are computed: cuda for a GPU (default: cpu, the same frames everywhere)."""
-
-    def __post_init__(self) -> None:
-        if self.photons_per_pixel is not None:
-            in_range("photons_per_pixel", self.photons_per_pixel, *PHOTON_RANGE)
 
     def samples(self, exposures: Exposures) -> int:
         """Samples along a pixel's edge for `exposures`."""

@@ -5,17 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
 from scipy import ndimage
 
-from ..checks import InputError, at_least, in_range, require
+from ..checks import InputError, require
 from ..geometry import Grid, Views
 from ..io.vtk import read_meshes
 from ..matter import Matter
 from ..mesh import TriangleMesh, ball_radius
-from ..ranges import Metres, Weight, checked_dataclass
+from ..ranges import Metres, Several, Weight, Within, checked_dataclass
 from ..representations import SurfaceMesh, isosurface
 from ..specimens.membrane.rest import FREQUENCIES, resting_cell
 from ..specimens.repair import closed
@@ -39,16 +40,14 @@ class KnownBody:
     """Unit of the file's coordinates."""
     size: Metres = 0.0
     """Largest extent at rest [m] (0: a red cell's 7.82 µm, or the file's)."""
-    uncertain: float = 0.1
+    uncertain: Annotated[float, Within(0, 0.3, above=True)] = 0.1
     """Largest relative change of the size of all bodies, which is fitted (0: fixed)."""
     stiffness: Weight = 100.0
     """Minus the logarithm of the probability of strains of about one: frames decide what they see, this the rest."""
-    instants: int = 9
+    instants: Several = 9
     """Times of the scan at which bodies are looked for together."""
 
     def __post_init__(self) -> None:
-        at_least(self, 2, "instants")
-        in_range("uncertain", self.uncertain, 0, 0.3)
         known = self.shape == RED_CELL or Path(self.shape).is_file()
         require(
             known, f"the body must be {RED_CELL} or a mesh file that exists, but it is {self.shape!r}; correct --body."

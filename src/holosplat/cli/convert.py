@@ -17,7 +17,7 @@ from ..io.images import TiffLayout
 from ..io.phase_maps import PhaseMaps, is_file, write_phase_maps
 from ..io.reading import Reading
 from ..matter import DeltaBeta, KnownRatio, MaterialPrior
-from ..ranges import Metres, Natural, Positive, Signed, checked_dataclass, flag
+from ..ranges import Metres, Natural, Positive, Signed, Within, checked_dataclass, flag
 from ..scan import Scan
 from ..units import number_of
 from .light import LightFlags
@@ -50,7 +50,7 @@ class WritingOptions:
 class EveningOptions:
     """Light that is the same in all frames."""
 
-    still_light: int | None = None
+    still_light: Annotated[int, Within(0, 32)] | None = None
     """Divide out the light that all training frames share: up to so many half waves across a frame, such as 4, or any
     pattern (0) (default: nothing)."""
     inside: Metres | None = None

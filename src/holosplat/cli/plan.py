@@ -20,10 +20,10 @@ from ..planning.contrast import Setup, Subject
 from ..planning.plan import Motion, Plan, Recording, Sampling, Storage, Survey, experiment, survey
 from ..planning.plan import plan as make_plan
 from ..progress import Advance
-from ..ranges import Grams, Many, Metres, Positive, Signed, Small, checked_dataclass
+from ..ranges import Many, Metres, Positive, Signed, Small, checked_dataclass
 from ..scan import DISTANCE_RANGE_M, ENERGY_RANGE_KEV
 from ..units import in_percent
-from .options import MaterialOptions
+from .options import MaterialOptions, OneMaterial
 from .places import Output
 from .progress import ProgressBar
 from .sentence import say
@@ -36,7 +36,7 @@ MOST_POINTS = 20_000
 
 
 @checked_dataclass
-class ObjectOptions:
+class ObjectOptions(OneMaterial):
     """The one object to be seen."""
 
     diameter: Small | None = None
@@ -51,12 +51,6 @@ class ObjectOptions:
     """Turn of the object about x, across the beam [degrees]: a red cell is seen face-on at 0 and edge-on at 90."""
     material: str = "haemoglobin"
     """Formula, or a name (holosplat materials lists them: haemoglobin, water, soft tissue, PMMA …)."""
-    density: Grams | None = None
-    """Its density [g/cm³]; a named one has its own."""
-    medium: str | None = None
-    """Formula or name of what surrounds it; none means vacuum."""
-    medium_density: Grams | None = None
-    """The medium's density [g/cm³]."""
 
     def subject(self) -> Subject:
         """The object that the options name."""

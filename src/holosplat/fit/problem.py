@@ -12,10 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..checks import at_least, require
 from ..geometry import Grid
 from ..model import Model
-from ..ranges import checked_dataclass
+from ..ranges import Natural, Several, SomeShare, checked_dataclass
 
 
 @checked_dataclass
@@ -28,7 +27,7 @@ class Schedule:
     """Frames drawn for each step (0: all training frames, which few views afford)."""
     views_at_once: int = 0
     """Of these, frames whose waves are in memory at a time (0: all)."""
-    decay: float = 0.1
+    decay: SomeShare = 0.1
     """Share of the rates that is left at the last step (exponential in between)."""
     warmup_steps: int = 0
     """Steps at the start in which only the material moves (amplitudes), as the thesis has it."""
@@ -36,23 +35,18 @@ class Schedule:
     """The thesis' rule: frames whose loss exceeds the batch's median give no gradient."""
     oversample: int = 0
     """Wave samples per detector pixel (0: from the width of the first fringe)."""
-    volume_every: int = 1
+    volume_every: Natural = 1
     """Steps between evaluations of the terms on the voxelised volume, which are weighted up accordingly."""
-    volume_edge: int = 160
+    volume_edge: Several = 160
     """Voxels along an edge of the (random) block of volume that such a step looks at."""
     validation_views: int = 0
     """Training frames set aside to choose the best state and to stop early."""
-    validate_every: int = 25
+    validate_every: Natural = 25
     """Steps between looks at them."""
     patience: int = 0
     """Looks without improvement before the fit stops (0: never)."""
     seconds: float = 0.0
     """The fit stops after so many seconds, its rates in step with that (0: by steps alone, and then reproducible)."""
-
-    def __post_init__(self) -> None:
-        at_least(self, 1, "volume_every", "validate_every")
-        at_least(self, 2, "volume_edge")
-        require(0 < self.decay <= 1, f"decay must lie in (0, 1], but it is {self.decay}.")
 
     def with_effort(self, effort: float) -> Schedule:
         """The same with `effort` times the steps, at least one."""

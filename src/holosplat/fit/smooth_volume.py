@@ -16,7 +16,7 @@ from ..checks import require
 from ..geometry import Grid
 from ..matter import DeltaBeta
 from ..projectors.voxels import projector_for
-from ..ranges import Signed, Weight, checked_dataclass
+from ..ranges import Positive, Signed, Weight, checked_dataclass
 from .projected_gradient import direction, product
 from .whitened import WhitenedFrames
 
@@ -47,23 +47,18 @@ class ContinuousPrior:
 
     slopes: Weight = 0.4
     """a: exponent of the power law of slopes."""
-    slope: Weight = 0.02
+    slope: Positive = 0.02
     """b: slope from one voxel to the next beyond which the law holds, as a share of the matter's level."""
-    rounding: Weight = 0.02
+    rounding: Positive = 0.02
     """ε: slopes below which the prior is a square, as a share of the level."""
     values: Weight = 0.02
     """m: exponent of the power law of values."""
-    value: Weight = 0.05
+    value: Positive = 0.05
     """v: distance from the nearest level beyond which the law holds, as a share of the matter's level."""
     levels: tuple[Signed, ...] = ()
     """Occupancies of the known materials; none where no density is known."""
     two_sided: bool = False
     """Whether u may be negative."""
-
-    def __post_init__(self) -> None:
-        for name in ("slope", "rounding", "value"):
-            given = getattr(self, name)
-            require(given > 0, f"{name} must be positive, but it is {given}.")
 
     def weakened(self, share: float) -> ContinuousPrior:
         """The prior with `share` of its exponents."""

@@ -159,14 +159,7 @@ class Decision:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, which `from_dict` takes."""
-        compared = [asdict(each) for each in self.compared]
-        return {
-            "name": self.name,
-            "choice": self.choice,
-            "by": self.by,
-            "compared": compared,
-            "seconds": self.seconds,
-        }
+        return asdict(self)
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> Decision:

@@ -12,16 +12,16 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from ..checks import InputError, finite, in_range, require
+from ..checks import InputError, finite, require
 from ..geometry import Grid
 from ..matter import DeltaBeta
 from ..plugins import Extended
 from ..progress import Advance
-from ..ranges import Small, checked_dataclass
+from ..ranges import Within, checked_dataclass
 from ..scan import Scan
 from ..volume import Object, Volume
 from . import arrays, euxfel, images, nxtomo
@@ -289,13 +289,9 @@ class StackMeaning:
     z), z for slices along it (rows of a page along y).
     """
 
-    voxel_size: Small
+    voxel_size: Annotated[float, Within(*VOXEL_RANGE_M, unit="metres")]
     of: DeltaBeta
     stacked: Literal["y", "z"] = "y"
-
-    def __post_init__(self) -> None:
-        in_range("voxel_size", self.voxel_size, *VOXEL_RANGE_M, unit="metres")
-        require(self.stacked in ("y", "z"), f"stacked must be y or z, but it is {self.stacked!r}.")
 
 
 def read_specimen(paths: Sequence[Path], meaning: StackMeaning | None) -> Volume:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import h5py
 import numpy as np
 
-from ..checks import InputError, finite, require
+from ..checks import InputError, as_written, finite, require
 from ..divided_light import DividedLight
 from .hdf5 import Fields, new_hdf5, open_hdf5, put
 
@@ -76,13 +76,11 @@ def read_divided_light(fields: Fields, projections: np.ndarray) -> DividedLight 
     if not isinstance(group, h5py.Group):
         return None
     label = fields.label(GROUP)
-    try:
+    with as_written(label, "what holosplat correct wrote"):
         arrays = [np.asarray(group[name], dtype=np.float64) for name in ARRAYS]
         whole, corner, binning = (np.asarray(group.attrs[name]).astype(int).ravel() for name in PLACE)
         place = (int(whole[0]), int(whole[1])), (int(corner[0]), int(corner[1])), int(binning[0])
         found = DividedLight(arrays[0], arrays[1], arrays[2], *place)
-    except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise InputError(f"{label} must be what holosplat correct wrote, but it lacks or garbles {error}.") from error
     count = int(projections.sum())
     require(len(found) == count, f"{label} must be of {count} projections, but it is of {len(found)}.")
     return found

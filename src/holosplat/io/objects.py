@@ -141,11 +141,9 @@ def put_whole(group: h5py.Group, name: str, whole: Whole) -> h5py.Dataset:
 
 def get_whole(dataset: h5py.Dataset, label: str) -> Whole:
     """What `put_whole` stored; `InputError` where its attributes say nothing sensible."""
-    try:
+    with as_written(label, "a tensor with its step, type and differences"):
         step, dtype = float(np.asarray(dataset.attrs["step"])), np.dtype(str(dataset.attrs["dtype"]))
         differences = bool(dataset.attrs["differences"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{label} must say its step, type and differences, but it lacks or garbles {error}.") from None
     numbers = np.asarray(dataset[()])
     if not (np.isfinite(step) and step >= 0 and dtype.kind in "iufb"):
         raise InputError(f"{label} must have a step of zero or more and a type of numbers, but has {step:g}, {dtype}.")

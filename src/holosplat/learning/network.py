@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, avg_pool3d, interpolate
 
-from ..checks import at_least, require
+from ..checks import require
 from ..geometry import Grid, Views
 from ..ranges import Natural, checked_dataclass
 
@@ -153,13 +153,12 @@ class Size:
 
     image: tuple[Natural, ...] = (16, 24, 32, 32)
     """Channels of the views' encoder, from its finest level to its coarsest."""
-    features: int = 12
+    features: Natural = 12
     """Channels that are lifted along the rays, of each view."""
     volume: tuple[Natural, ...] = (16, 40, 80)
     """Channels of the volumes' U-Nets, from the finest level to the coarsest."""
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "features")
         for name in ("image", "volume"):
             require_levels(name, getattr(self, name))
 

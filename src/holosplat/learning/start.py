@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, pad
 
 from ..baselines.rays import frames_of, refined
@@ -37,6 +37,7 @@ from .network import COPIES, FINE, THICKNESS, Guess, Size, Taps, coarse, thickne
 SHIPPED = Path(__file__).with_name("red_cells.safetensors")
 """Weights that may come with the package."""
 Kind = TypeVar("Kind")
+Net = TypeVar("Net", bound=nn.Module)
 VERSION = 1
 """Of the network's layout."""
 
@@ -83,10 +84,7 @@ class Trained:
 
 def write_weights(path: Path, network: Guess, card: Card) -> None:
     """Write the weights in half precision, whole or not at all; a megabyte holds half a million."""
-    said = {"holosplat": str(VERSION), "size": json.dumps(asdict(network.size)), "card": json.dumps(asdict(card))}
-    tensors = {name: value.detach().half().contiguous() for name, value in network.state_dict().items()}
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(save(tensors, said))
+    write_network(path, network, card, str(VERSION), torch.half)
 
 
 @lru_cache(maxsize=2)
@@ -97,21 +95,33 @@ def read_weights(path: Path = SHIPPED) -> Trained:
             "no weights come with this version of holosplat; train a network (holosplat dataset, holosplat train) and "
             "name its file with --set weights=FILE."
         )
+    return Trained(*read_network(path, Guess, Size, str(VERSION), "holosplat train"))
+
+
+def write_network(path: Path, network: Any, card: Card, version: str, kind: torch.dtype) -> None:
+    """Write the weights of a `network` of that version as numbers of a `kind`, and its card, whole or not at all."""
+    said = {"holosplat": version, "size": json.dumps(asdict(network.size)), "card": json.dumps(asdict(card))}
+    tensors = {name: value.detach().to("cpu", kind).contiguous() for name, value in network.state_dict().items()}
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(save(tensors, said))
+
+
+def read_network(path: Path, net: Callable[[Any], Net], size: type, version: str, command: str) -> tuple[Net, Card]:
+    """The network `net` of the size that a file says, and its card; `InputError` for a file that the `command` did not
+    write, or of another version."""
     tensors, said = tensors_of(path)
-    if said.get("holosplat") != str(VERSION):
-        raise InputError(
-            f"{path} must hold weights of version {VERSION} of holosplat's network, but it holds "
-            f"{said.get('holosplat', 'others')}; train anew (holosplat train)."
-        )
+    require(
+        said.get("holosplat") == version,
+        f"{path} must hold weights of version {version} of holosplat's network, but it holds "
+        f"{said.get('holosplat', 'others')}; train anew ({command}).",
+    )
     with as_written(path, "what holosplat train wrote"):
-        network = Guess(size_of(Size, said, tensors))
-        card = card_of(said)
+        network, card = net(size_of(size, said, tensors)), card_of(said)
     try:
         network.load_state_dict(tensors)
     except RuntimeError as error:
         raise InputError(f"{path} must hold the weights of the network that it says, but: {error}.") from None
-    network.eval().requires_grad_(False)
-    return Trained(network, card)
+    return network.eval().requires_grad_(False), card
 
 
 def size_of(kind: type[Kind], said: Mapping[str, str], tensors: Mapping[str, Tensor]) -> Kind:

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
 from ..backends import Backend
 from ..baselines import HolographicTV
 from ..baselines.material import MaterialEstimate
 from ..baselines.two_materials import TwoMaterials
-from ..checks import at_least, require
 from ..fit.density import DensityControl
 from ..fit.problem import Schedule
 from ..fit.terms import Objective
 from ..learning.start import LearnedStart
-from ..ranges import Pixels, Rate, Share, Weight, checked_dataclass
+from ..ranges import Natural, Positive, Rate, Share, Weight, Within, checked_dataclass
 from .coarse import CoarseToFine
 from .ground import ExtraTerm
 
@@ -64,13 +63,13 @@ class GaussianOptions:
     start: Literal["phase", "learned", "random"] = "phase"
     """`phase`: phase retrieval, total-variation tomography, Gaussians where there is matter; `learned`: the same where
     a network guesses it, if that explains the frames clearly better; or `random`."""
-    spacing_px: Pixels = 1.0
+    spacing_px: Positive = 1.0
     """Distance between Gaussians at a phase start [pixels]."""
     spacing_noise: Weight = 2.3
     """What it grows by, as a share, for the share of the frames' contrast that is noise, at most to twice."""
-    max_start: int = 150_000
+    max_start: Natural = 150_000
     """Gaussians at the start, at most: their distance grows rather than their number."""
-    start_per_pixel: float = 1.5
+    start_per_pixel: Positive = 1.5
     """Gaussians at the start for each pixel of all frames, at most: beyond that, the insides of bulky bodies, where
     nothing changes, get larger ones."""
     approximate_steps: int = 50
@@ -79,11 +78,11 @@ class GaussianOptions:
     """Adam's rates in these steps, of which a tenth is left at the last one."""
     filled: Share = 0.05
     """Share of matter from which on a block of the starting volume becomes a Gaussian."""
-    random_count: int = 8_000
+    random_count: Natural = 8_000
     """Gaussians of a random start."""
     separate: bool = False
     """Whether, with nothing known of the matter, δ and β are fitted apart, not at the one ratio that frames suggest."""
-    most_materials: int = 2
+    most_materials: Annotated[int, Within(1, 2)] = 2
     """How many materials (1 or 2) may be found where nothing is known."""
     estimate: MaterialEstimate = field(default_factory=MaterialEstimate)
     """How δ/β and δ are found where they are not known."""
@@ -96,12 +95,3 @@ class GaussianOptions:
     coarse: CoarseToFine = field(default_factory=CoarseToFine)
     """How large frames of closed bodies start."""
     fit: FitOptions = field(default_factory=FitOptions)
-
-    def __post_init__(self) -> None:
-        require(self.spacing_px > 0, f"spacing_px must be positive, but it is {self.spacing_px}.")
-        at_least(self, 1, "max_start", "random_count")
-        require(self.start_per_pixel > 0, f"start_per_pixel must be positive, but it is {self.start_per_pixel}.")
-        require(
-            self.most_materials in (1, 2),
-            f"most_materials must be 1 or 2, but it is {self.most_materials}; no more than two can be told apart.",
-        )

@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import field, replace
-from typing import cast
+from typing import Annotated, cast
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from torch import Tensor
 from ..baselines import HolographicTV, holographic_tv
 from ..baselines.beyond import margins_of
 from ..baselines.tomography import plateau
-from ..checks import at_least, require
+from ..checks import require
 from ..fit.residuals import set_aside
 from ..fit.smooth_volume import ContinuousPrior, VolumeProblem, descend
 from ..fit.whitened import WhitenedFrames
@@ -31,7 +31,7 @@ from ..memory import memory_kept
 from ..optics.coherence import joined_blur_px
 from ..optics.noise import NoiseModel
 from ..optics.sampling import fringe_sampling
-from ..ranges import Share, checked_dataclass
+from ..ranges import MOST, Natural, Share, Within, checked_dataclass
 from ..representations import VoxelGrid
 from ..scan import Scan
 from .method import Task, quiet
@@ -59,7 +59,7 @@ Constants = Mapping[str, float]
 class ProfileOptions:
     """How the likelihood of constants is computed."""
 
-    width: int = 64
+    width: Annotated[int, Within(16, MOST)] = 64
     """Frames are binned to at most so many pixels [pixels]: a volume of them takes seconds."""
     faint: float = 0.08
     """Part of the matter's level from which on a voxel of the first volume belongs to the support."""
@@ -67,7 +67,7 @@ class ProfileOptions:
     """Voxels by which the support is wider, for rims."""
     doubt: Share = 0.01
     """Part of the contrast (rms) that counts as noise besides: without any, a fit would not come to its end."""
-    iterations: int = 30
+    iterations: Natural = 30
     """Iterations of each of two rounds, whose second takes the level of matter from the first."""
     start: HolographicTV = field(
         default_factory=lambda: HolographicTV(
@@ -80,8 +80,6 @@ class ProfileOptions:
     towards those that need fewer slopes; here the support does most."""
 
     def __post_init__(self) -> None:
-        at_least(self, 16, "width")
-        at_least(self, 1, "iterations")
         require(0 < self.faint < 1, f"faint must lie between 0 and 1, but it is {self.faint:g}.")
 
 

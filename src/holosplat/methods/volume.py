@@ -4,7 +4,7 @@ level of matter with sharp edges of which only the ratio δ/β is known."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import torch
 
@@ -12,13 +12,13 @@ from ..backends import Backend
 from ..baselines import HolographicTV, holographic_tv
 from ..baselines.beyond import margins_of
 from ..baselines.material import DEFAULT, MaterialEstimate, level_of
-from ..checks import at_least, require
+from ..checks import require
 from ..fit.smooth_volume import ContinuousPrior
 from ..frames import evenly
 from ..geometry import Grid
 from ..matter import DeltaBeta, KnownRatio, Matter, MatterKind
 from ..optics.retrieval.spectra import contrast_level
-from ..ranges import Signed, Weight, checked_dataclass
+from ..ranges import LARGEST, Natural, Signed, Weight, Within, checked_dataclass
 from ..representations import Stored, VoxelGrid
 from ..scan import Scan
 from .cross_validation import assumed_material, predicted_frames
@@ -66,21 +66,20 @@ class SmoothVolume(Method):
     """Level of the even matter with which the fit begins on the largest voxels, as a share of the start's; 0: with the
     start. What a start takes of noise and light for matter would stay (benchmarks/beginnings.py); of far less the prior
     leaves nothing."""
-    loose: float = 10.0
+    loose: Annotated[float, Within(1, LARGEST)] = 10.0
     """How many times that is the level of the prior in the first round. One for matter so faint would wipe it out; on
     large voxels frames hardly need a prior."""
     rounds: int = 3
     """How often a fit is followed by the modulations that undo what the prior takes."""
     iterations: int = 20
     """Iterations of a round."""
-    max_voxels: int = 20_000_000
+    max_voxels: Natural = 20_000_000
     """Frames are binned rather than having more voxels than this."""
     known_total: tuple[Signed, ...] = ()
     """Total δ of spherical matter, and the standard error of that [m³], where something else than frames tells them,
     as the other times of a series do; empty: nothing does."""
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "max_voxels", "loose")
         sizes = all(factor >= 2 for factor in self.coarser) and list(self.coarser) == sorted(self.coarser, reverse=True)
         known = len(self.known_total) in (0, 2) and all(error > 0 for error in self.known_total[1:])
         said = f"known_total must be a total and its positive standard error, or empty, but it is {self.known_total}."

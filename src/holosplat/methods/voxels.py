@@ -10,7 +10,7 @@ import torch
 
 from ..baselines import HolographicTV, holographic_tv
 from ..baselines.beyond import margins_of
-from ..checks import at_least, require
+from ..checks import require
 from ..fit.loop import Fit, Plan
 from ..fit.optimiser import Leaves
 from ..fit.problem import Problem, Schedule
@@ -21,7 +21,7 @@ from ..geometry import Grid
 from ..matter import Matter
 from ..optics.background import Light
 from ..optics.sampling import fringe_sampling
-from ..ranges import Weight, checked_dataclass
+from ..ranges import Natural, Positive, Weight, checked_dataclass
 from ..representations import Stored, VoxelGrid
 from ..scan import Scan
 from .cross_validation import assumed_material
@@ -73,19 +73,19 @@ class VoxelFit:
 
     coarse_steps: int = 0
     """Evaluations of the wave model and its gradient with one voxel a pixel, before the finest voxels."""
-    steps: int = 60
+    steps: Natural = 60
     """Evaluations with the finest voxels."""
     weight: Weight = 0.05
     """Weight of total variation, in voxel edges of thickness."""
     noise_weight: Weight = 0.03
     """What it grows by for every pixel of thickness that the noise of the frames amounts to."""
-    smoothing: float = 0.005
+    smoothing: Positive = 0.005
     """Differences between voxels below which total variation is a square."""
     upper: Weight = 1.0
     """Bound of the occupancy of a known material (0: none)."""
     refine: int = 0
     """Voxels along a pixel's edge (0: as the first fringe needs)."""
-    max_voxels: int = 20_000_000
+    max_voxels: Natural = 20_000_000
     """Coarser voxels rather than more than this many."""
     objective: Objective = field(default_factory=lambda: Objective(l1=0.0, spectral=1.0, floor=0.1))
     """How frames are compared."""
@@ -95,8 +95,6 @@ class VoxelFit:
     """Further terms by name."""
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "steps", "max_voxels")
-        require(self.smoothing > 0, f"smoothing must be positive, but it is {self.smoothing}.")
         require(
             self.schedule.views_per_step == 0,
             f"voxels need views_per_step = 0, all frames in every step, but it is {self.schedule.views_per_step}.",

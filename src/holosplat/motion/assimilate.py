@@ -16,12 +16,12 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
-from ..checks import at_least, positive, require
+from ..checks import require
 from ..matter import Matter
 from ..mesh import TriangleMesh, joined
 from ..metrics.volumes import normal_distance
 from ..model import Instrument, Model
-from ..ranges import ranged
+from ..ranges import Natural, Positive, ranged
 from ..representations import SurfaceMesh
 from ..scan import Scan
 from .cell_model import CellModel, Range
@@ -51,18 +51,16 @@ class Assimilation:
     """Of the flow [m/s], two standard deviations below and above; equal: known."""
     shear: Range = (2e-6, 10e-6)
     """Skalak's modulus [N/m], likewise."""
-    state: float = 0.1e-6
+    state: Positive = 0.1e-6
     """Standard deviation of the first state: how far a cell may be moved, or its surface by a linear map [m]."""
-    oversample: int = 2
+    oversample: Natural = 2
     """Wave samples a pixel: the gradient of a surface is right to second order in their distance."""
-    steps: int = 20
+    steps: Natural = 20
     """Of L-BFGS, at most."""
     curvature: bool = True
     """Whether to compute standard errors from the curvature at the end, where unknowns are few enough."""
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "steps", "oversample")
-        positive("state", self.state, "metres")
         for name, (low, high) in (("peak", self.peak), ("shear", self.shear)):
             require(
                 0 < low <= high, f"{name} must be a range LOW:HIGH above 0, but it is {low:g}:{high:g}; correct it."

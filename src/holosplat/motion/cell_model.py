@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..checks import InputError, positive
+from ..checks import InputError
 from ..mesh import TriangleMesh, areas, normals
 from ..ranges import Signed, Small, ranged
 from ..specimens.flow.suspension import Channel, Medium
@@ -60,10 +60,6 @@ class ChannelFrame:
     axis: Literal["x", "y", "z"] = "y"
     centre: tuple[Signed, Signed, Signed] = (0.0, 0.0, 0.0)
     back: bool = False
-
-    def __post_init__(self) -> None:
-        for extent in self.across:
-            positive("channel", extent, "metres")
 
     @property
     def channel(self) -> Channel:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -14,7 +14,6 @@ from torch import Tensor
 
 from ..baselines import HolographicTV, holographic_tv
 from ..bodies.rest_shape import EDGE, LEAST_VOLUME, LEVEL, SMOOTHING, centroid, cut_bodies, is_cut
-from ..checks import in_range
 from ..fit.residuals import Prediction
 from ..geometry import Grid, Views
 from ..inference import Decision, Score, select
@@ -23,7 +22,7 @@ from ..learning.start import Guessed, LearnedStart, guess_matter, missing_thickn
 from ..matter import DeltaBeta, Matter
 from ..mesh import TriangleMesh, ball_radius
 from ..progress import Progress
-from ..ranges import Pixels, Weight, ranged
+from ..ranges import Pixels, Weight, Within, ranged
 from ..representations import MovingSurfaces, VoxelGrid
 from ..scan import Scan
 
@@ -68,7 +67,7 @@ class SightingOptions:
 
     volume: HolographicTV = field(default_factory=lambda: HolographicTV(iterations=60, corrections=0))
     """The volume of one time by itself: 160 iterations find no other bodies than 60 do."""
-    level: float = LEVEL
+    level: Annotated[float, Within(0.01, 0.99)] = LEVEL
     """Occupancy at the surface."""
     least_volume: Weight = LEAST_VOLUME
     """Bodies of fewer voxels are left out: noise, or too little to be followed."""
@@ -76,9 +75,6 @@ class SightingOptions:
     """Steps that smooth away the voxels' traces."""
     edge: Pixels = EDGE
     """Bodies that come nearer to the field's edge than this are cut by it [pixels]."""
-
-    def __post_init__(self) -> None:
-        in_range("level", self.level, 0.01, 0.99)
 
 
 def sightings(

@@ -12,7 +12,7 @@ from scipy.sparse import csc_array, diags_array, eye_array
 from scipy.sparse.linalg import splu
 from torch import Tensor
 
-from ..checks import at_least, in_range, positive, require
+from ..checks import require
 from ..fit.loop import Fit, Plan
 from ..fit.optimiser import Adam, Group, Leaves, Optimiser
 from ..fit.problem import Problem, Schedule, Term
@@ -24,7 +24,7 @@ from ..methods.ground import Ground, ground
 from ..methods.surface_fit import BETAS, EPSILON, oversampling
 from ..optics.background import Light
 from ..optics.noise import noise_share
-from ..ranges import Rate, Weight, ranged
+from ..ranges import Degree, Natural, Positive, Several, Weight, ranged
 from ..representations import MovingSurfaces
 from ..representations.isosurface import adjacency
 from ..scan import Scan
@@ -42,7 +42,7 @@ path takes no steps that are longer than by its inverse."""
 class MotionFit:
     """Options of a fit of moving surfaces."""
 
-    rate: Rate = 0.2
+    rate: Positive = 0.2
     """Length of the first steps [pixels], the same for all vertices; a tenth of the longest one of L-BFGS."""
     pairs: int = 0
     """Pairs of steps that L-BFGS remembers, whose steps look at all frames (0: steps are Adam's)."""
@@ -64,9 +64,6 @@ class MotionFit:
     """How frames are compared, and what bending costs."""
     schedule: Schedule = field(default_factory=lambda: Schedule(steps=100, views_per_step=16))
     """The loop; memory is that of the frames of one step, of which L-BFGS takes several for one of its own."""
-
-    def __post_init__(self) -> None:
-        positive("rate", self.rate, "pixels")
 
 
 def converged() -> MotionFit:
@@ -197,19 +194,14 @@ NAME, BY = "pieces of paths", "frames set aside"
 class PathOptions:
     """How vertices move."""
 
-    degree: int = 2
+    degree: Degree = 2
     """Of the polynomials of time: 2 leaves 0.002 µm of the paths of flowing cells over 16 times."""
     pieces: int = 0
     """Pieces of their splines (0: chosen from the data)."""
-    most_pieces: int = 8
+    most_pieces: Natural = 8
     """At most, where frames are asked."""
-    held_out: int = 5
+    held_out: Several = 5
     """One frame in so many is held out to ask them."""
-
-    def __post_init__(self) -> None:
-        in_range("degree", self.degree, 1, 5)
-        at_least(self, 1, "most_pieces")
-        at_least(self, 2, "held_out")
 
 
 def chosen_paths(

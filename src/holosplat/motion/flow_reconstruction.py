@@ -18,7 +18,6 @@ import torch
 from torch import Tensor
 
 from ..baselines.tomography import plateau
-from ..checks import at_least, positive, require
 from ..fit.flow_volume import FlowProblem, likelier_fading, likelier_flow
 from ..fit.run import Run
 from ..fit.smooth_volume import descend
@@ -29,7 +28,7 @@ from ..methods import Task
 from ..methods.illumination import prepared
 from ..methods.smooth_fit import SmoothFit
 from ..methods.volume import SmoothStage, SmoothVolume
-from ..ranges import Pixels, Weight, ranged
+from ..ranges import Natural, Positive, Several, Weight, ranged
 from ..representations import (
     Fading,
     Flow,
@@ -69,41 +68,34 @@ class FlowOptions:
 
     volume: SmoothVolume = field(default_factory=SmoothVolume)
     """The volume of a time by itself, and of all times as if nothing moved."""
-    cells: int = 4
+    cells: Natural = 4
     """Cells of the flow along the longest edge of the field, at first."""
-    most_cells: int = 6
+    most_cells: Natural = 6
     """Upper limit, where held-out frames support more."""
     most_degree: int = 2
     """Highest degree of the flow in time."""
-    steps: int = 6
+    steps: Natural = 6
     """Steps of Runge and Kutta from the first time to the last."""
     sources: bool = False
     """Whether the flow may have a divergence where no matter is, as in a foam whose bubbles shrink."""
-    strain: Weight = 1.0
+    strain: Positive = 1.0
     """Standard deviation expected of what is not rigid of the motion, over all times (as-rigid-as-possible)."""
-    divergence: Weight = 0.3
+    divergence: Positive = 0.3
     """Standard deviation expected of the divergence of sources, over all times."""
     fading: Weight = 0.0
     """Standard deviation expected of what the logarithm of δ changes by, over all times (0: matter stays as much)."""
-    iterations: int = 12
+    iterations: Natural = 12
     """Iterations for the flow and for the volume, each time that the two take turns."""
-    final: int = 40
+    final: Natural = 40
     """Iterations of the volume on voxels of a pixel, at least."""
-    most_final: int = 160
+    most_final: Natural = 160
     """At most, where held-out frames are predicted better after more."""
-    held_out: int = 5
+    held_out: Several = 5
     """One frame in so many is held out to ask how free the flow is."""
-    spacing_px: Pixels = 2.0
+    spacing_px: Positive = 2.0
     """Distance between the Gaussians that stand for the volume [pixels]."""
-    approximate_steps: int = 60
+    approximate_steps: Natural = 60
     """Steps in which they learn it."""
-
-    def __post_init__(self) -> None:
-        at_least(self, 1, "cells", "most_cells", "steps", "iterations", "final", "most_final", "approximate_steps")
-        at_least(self, 2, "held_out")
-        for name in ("strain", "divergence"):
-            require(getattr(self, name) > 0, f"{name} must be above zero, but it is {getattr(self, name):g}.")
-        positive("spacing_px", self.spacing_px, "pixels")
 
 
 @dataclass(frozen=True)

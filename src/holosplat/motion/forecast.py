@@ -8,11 +8,11 @@ from typing import ClassVar, Protocol
 
 import numpy as np
 
-from ..checks import InputError, in_range
+from ..checks import InputError
 from ..inference import Decision, Score, select
 from ..mesh import TriangleMesh, across, areas
 from ..plugins import Extended
-from ..ranges import ranged
+from ..ranges import Degree, ranged
 from ..representations import MovingSurfaces, TimeBasis
 from ..representations.flow import path_positions
 from .elastic import Rest
@@ -35,7 +35,7 @@ class PathForecast:
 
     kind: ClassVar[str] = "paths"
 
-    degree: int = 2
+    degree: Degree = 2
     """Powers of time that are believed, at most: 2 leaves 0.03 µm of the paths of flowing cells over 50 times."""
     window: int = 0
     """Last times of the run that tell the motion (0: all)."""
@@ -43,9 +43,6 @@ class PathForecast:
     """Whether shapes stay as they are at the last time, and bodies move and turn alone."""
     keep_volume: bool = True
     """Whether bodies have the mean volume of the window; of flowing cells it is kept to 0.6 %."""
-
-    def __post_init__(self) -> None:
-        in_range("degree", self.degree, 1, 5)
 
     def times(self, times: np.ndarray) -> np.ndarray:
         """The times of the window, of all `times` [T] of the run: one more than the degree at least, where there are

@@ -11,8 +11,7 @@ is given by Legendre polynomials of degree `DEGREE`, which paths of flowing cell
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
@@ -21,12 +20,10 @@ from typing import ClassVar
 import numpy as np
 import torch
 from numpy.polynomial import legendre
-from safetensors.torch import save
 from torch import Tensor, nn
 
-from ..checks import InputError, as_written, require
-from ..io.atomic import atomic_path
-from ..learning.start import Card, card_of, size_of, tensors_of
+from ..checks import require
+from ..learning.start import Card, read_network, write_network
 from ..mesh import TriangleMesh, ball_radius
 from ..ranges import ManyOrNone, Natural, ranged
 from ..specimens.flow.suspension import PLASMA_VISCOSITY
@@ -246,28 +243,13 @@ class LearnedDynamics:
 
 def write_dynamics(path: Path, network: Dynamics, card: Card) -> None:
     """Write the weights, whole or not at all."""
-    said = {"holosplat": VERSION, "size": json.dumps(asdict(network.size)), "card": json.dumps(asdict(card))}
-    tensors = {name: value.detach().float().contiguous().cpu() for name, value in network.state_dict().items()}
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(save(tensors, said))
+    write_network(path, network, card, VERSION, torch.float)
 
 
 @lru_cache(maxsize=2)
 def read_dynamics(path: Path = SHIPPED) -> LearnedDynamics:
     """The network in a file; `InputError` for one that `holosplat train --network dynamics` did not write."""
-    tensors, said = tensors_of(path)
-    require(
-        said.get("holosplat") == VERSION,
-        f"{path} must hold weights of version {VERSION!r}, but it holds {said.get('holosplat', 'others')!r}; train it "
-        "(holosplat train --network dynamics).",
-    )
-    with as_written(path, "what holosplat train wrote"):
-        network, card = Dynamics(size_of(DynamicsSize, said, tensors)), card_of(said)
-    try:
-        network.load_state_dict(tensors)
-    except RuntimeError as error:
-        raise InputError(f"{path} must hold the weights of the network that it says, but: {error}.") from None
-    return LearnedDynamics(network.eval().requires_grad_(False), card)
+    return LearnedDynamics(*read_network(path, Dynamics, DynamicsSize, VERSION, "holosplat train --network dynamics"))
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,10 @@ from scipy.fft import next_fast_len
 from scipy.ndimage import maximum_filter
 from torch import Tensor
 
-from ..checks import at_least, in_range, require, shaped
+from ..checks import in_range, require, shaped
 from ..frames import block_means
 from ..optics.resampling import InLine
-from ..ranges import Signed, ranged
+from ..ranges import Natural, Signed, ranged
 from .track_linking import LinkOptions, Seen, identified, path_degree
 
 NUMBERS = 4
@@ -33,13 +33,12 @@ class ParticleOptions:
     """Radii [m] of the smallest and the largest particle."""
     depth: tuple[Signed, Signed] = (-0.03, 0.03)
     """Where they may be along the beam [m], from the plane z = 0."""
-    bins: int = 2
+    bins: Natural = 2
     """Pixels that are joined along each side before the fit."""
-    rounds: int = 3
+    rounds: Natural = 3
     """How often particles are looked for beside those that are found."""
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "bins", "rounds")
         in_range("least radius", self.radius[0], 0.0, self.radius[1], unit="metres")
         require(
             self.depth[0] < self.depth[1],

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from ..bodies.rest_shape import KnownBody
-from ..checks import at_least, in_range, require
+from ..checks import require
 from ..fit.problem import Schedule
 from ..inference import Score, select
 from ..learning.start import LearnedStart
 from ..matter import DeltaBeta, Matter
 from ..mesh import ball_radius
-from ..ranges import Share, ranged
+from ..ranges import Natural, Share, Within, ranged
 from ..representations import MovingSurfaces, TimeBasis
 from .detections import Detection, SightingOptions
 from .fit import MotionFit, PathOptions, converged
@@ -50,16 +50,12 @@ class LinkOptions:
 
     gate: float = 0.8
     """A body is looked for within so many radii of where its velocity leads."""
-    change: float = 0.3
+    change: Annotated[float, Within(0.01, 0.99)] = 0.3
     """By which part a body that is seen whole may change its volume: less than a merger with half a body does."""
     gap: int = 6
     """Times that a track may miss."""
-    least: int = 2
+    least: Natural = 2
     """Sightings that make a track, unless it is near the field's edge, where bodies enter and leave."""
-
-    def __post_init__(self) -> None:
-        at_least(self, 1, "least")
-        in_range("change", self.change, 0.01, 0.99)
 
 
 Track = tuple[int, ...]

@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from ..checks import InputError, require
+from ..checks import InputError
 from ..divided_light import DividedLight
 from ..ranges import checked_dataclass
 from .air import Box, air_in_boxes, find_air, has_air
@@ -58,14 +58,6 @@ class LightOptions:
     there is none. Where `kind` is even, there is none either."""
     noise: Noise = "auto"
     """auto: correlated where evidence is for it, else white; white; correlated: in any case."""
-
-    def __post_init__(self) -> None:
-        require(
-            self.kind in ("auto", "even", "smooth"), f"light must be auto, even or smooth, but it is {self.kind!r}."
-        )
-        require(self.still in ("auto", "none"), f"still light must be auto or none, but it is {self.still!r}.")
-        known = self.noise in ("auto", "white", "correlated")
-        require(known, f"noise must be auto, white or correlated, but it is {self.noise!r}.")
 
     def air_of(self, frames: Tensor) -> Tensor:
         """The air [V, H, W] bool of frames [V, H, W]; pixels that are NaN, which have no value, are none."""

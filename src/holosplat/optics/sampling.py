@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from scipy.fft import next_fast_len
 from torch import Tensor
 
 from ..geometry import Grid
@@ -111,16 +112,9 @@ def resolving_oversample(exposures: Exposures, samples_per_fringe: float, at_lea
 
 def smooth_margin(length: int, margin: int) -> int:
     """The least margin, not below `margin`, with which `length + 2 margin` has no prime factor above 5."""
-    while not _is_5_smooth(length + 2 * margin):
+    while next_fast_len(whole := length + 2 * margin, real=True) != whole:
         margin += 1
     return margin
-
-
-def _is_5_smooth(n: int) -> bool:
-    for p in (2, 3, 5):
-        while n % p == 0:
-            n //= p
-    return n == 1
 
 
 class SharedPoses:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -251,27 +251,8 @@ class Settings:
     def from_table(cls, table: Mapping[str, Any]) -> Settings:
         """The settings that `as_table` described; `InputError` for anything else."""
         values = dict(table)
-        plain = from_table(_Plain, {f.name: values.pop(f.name) for f in fields(_Plain) if f.name in values})
-        read: dict[str, Callable[[Any], Any]] = {
-            "method": lambda value: method_of(value, "method"),
-            "warm": lambda value: from_table(Warm, value, "warm"),
-            "motion": lambda value: from_table(TrackOptions, value, "motion"),
-            "light": lambda value: from_table(LightOptions, value, "light"),
-        }
-        unknown = [name for name in values if name not in read]
-        require(not unknown, f"{', '.join(unknown)} is not known; remove it.")
-        return cls(**vars(plain), **{name: read[name](value) for name, value in values.items()})
-
-
-@dataclass(frozen=True)
-@ranged
-class _Plain:
-    """The settings that are plain values."""
-
-    act: Act = "reconstruct"
-    matter: MatterKind | None = None
-    seed: Seed = 0
-    reports: bool = False
+        told = {"method": method_of(values.pop("method"), "method")} if "method" in values else {}
+        return replace(from_table(cls, values), **told)
 
 
 def prior_of(table: Mapping[str, Any]) -> MaterialPrior:
@@ -313,7 +294,6 @@ class Cut:
     """Times before its own that a task also does: a run-in, and what says how well tasks agree."""
 
     def __post_init__(self) -> None:
-        require(self.overlap >= 0, f"overlap must not be negative, but it is {self.overlap}.")
         require(self.overlap <= self.window, f"overlap must be at most the window, {self.window}, but is larger.")
 
 
@@ -344,8 +324,6 @@ class Slurm:
             value = getattr(self, name)
             fits = not value or WORD.fullmatch(value) is not None
             require(fits, f"{name} must be a word of letters, digits and -_.,:+, but it is {value!r}; correct it.")
-        require(bool(self.time), "time must be a limit such as 01:00:00, but it is empty; give one.")
-        require(self.limit >= 0, f"limit must be 0 (none) or more, but it is {self.limit}.")
 
 
 def listed(paths: Sequence[Path]) -> list[Path]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Annotated, Protocol
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from ..checks import finite, in_range, require, shaped
 from ..frames import block_means
 from ..geometry import Grid, Views
 from ..matter import DeltaBeta
-from ..ranges import checked_dataclass
+from ..ranges import Within, checked_dataclass
 from ..volume import LineIntegrals, Unmoved, Volume
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(16)
@@ -64,11 +64,8 @@ class Profile(Protocol):
 class Soft:
     """One inside, zero outside, and half a period of a cosine between: from `1 - width / 2` to `1 + width / 2`."""
 
-    width: float = 0.0
+    width: Annotated[float, Within(0, 2)] = 0.0
     """Width of the edge in units of the semi-axes, 0 (sharp) to 2 (a raised cosine from the middle on)."""
-
-    def __post_init__(self) -> None:
-        require(0 <= self.width <= 2, f"width of an edge must lie between 0 and 2, but it is {self.width:g}.")
 
     @property
     def reach(self) -> float:
@@ -108,12 +105,9 @@ class Soft:
 class Bump:
     """`(1 - s²)^power` inside, which is smooth at its edge to the order `power - 1`."""
 
-    power: int = 3
+    power: Annotated[int, Within(1, 20)] = 3
     """Exponent, 1 to 20."""
     reach, core = 1.0, 0.0
-
-    def __post_init__(self) -> None:
-        require(1 <= self.power <= 20, f"power of a bump must lie between 1 and 20, but it is {self.power}.")
 
     @property
     def mass(self) -> float:

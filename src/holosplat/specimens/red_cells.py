@@ -12,13 +12,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from ..checks import InputError, finite, in_range, require, shaped
 from ..mesh import TriangleMesh, normals
-from ..ranges import Stretch, ranged
+from ..ranges import Stretch, Within, ranged
 
 RADIUS = 3.91e-6
 THICKNESS = (0.81e-6, 7.83e-6, -4.39e-6)
@@ -46,7 +46,7 @@ COARSE_POINTS, FINE_LEVEL = 162, 4
 class RedCell:
     """One cell: size, pose and bending. Bending and stretch keep the volume exactly (unit Jacobian)."""
 
-    diameter: float = DIAMETER
+    diameter: Annotated[float, Within(1e-9, 1, unit="metres")] = DIAMETER
     """Of the undeformed cell [m]."""
     rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
     """[3, 3], with `x = rotation @ x_cell + centre` and the cell's axis along its own z."""
@@ -58,7 +58,6 @@ class RedCell:
     """[5] amplitudes of the mid-plane's bending [radii]: Zernike's bowl, two saddles, two trefoils, unit rms each."""
 
     def __post_init__(self) -> None:
-        in_range("cell diameter", self.diameter, 1e-9, 1.0, unit="metres")
         for name, shape in (("rotation", (3, 3)), ("centre", (3,)), ("bend", (5,))):
             array = np.asarray(getattr(self, name), dtype=np.float64)
             object.__setattr__(self, name, finite(f"cell {name}", shaped(f"cell {name}", array, shape)))

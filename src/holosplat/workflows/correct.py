@@ -29,7 +29,7 @@ from ..preprocess import (
 )
 from ..preprocess.pixels import MOST_DEFECTS, filled
 from ..progress import Advance
-from ..ranges import checked_dataclass
+from ..ranges import Natural, checked_dataclass
 from ..scan import Scan
 from .run_illumination import AirLight, Look
 
@@ -63,22 +63,17 @@ class CorrectionOptions:
     rings: int | None = None
     """Take out what all projections have in common in details finer than this odd number of columns, such as 5: noise
     and dust of few flats, which make rings. Lines of the object along its axis go, too (default: nothing)."""
-    components: int | None = None
+    components: Natural | None = None
     """Most principal components (default: as many as stand out of the noise)."""
-    binning: int | None = None
+    binning: Natural | None = None
     """Pixels are averaged this many by this many to find their weights (default: 8, less for small frames)."""
 
     def __post_init__(self) -> None:
-        known = self.method in (None, "dynamic", "plain")
-        require(known, f"method must be dynamic or plain, but it is {self.method!r}.")
-        known = self.normalise in (None, "air", "mean", "rim", "none")
-        require(known, f"normalise must be air, mean, rim or none, but it is {self.normalise!r}.")
         goes = not self.air or self.normalise in (None, "air")
         require(goes, f"--air goes with --normalise air, but this is {self.normalise}; leave one of them.")
         for name in ("components", "binning"):
             value = getattr(self, name)
             require(value is None or self.method != "plain", f"{name} goes with the method dynamic; leave it.")
-            require(value is None or value >= 1, f"{name} must be at least 1, but it is {value}.")
 
 
 @dataclass(frozen=True)

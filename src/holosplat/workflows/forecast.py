@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import torch
@@ -26,7 +26,7 @@ from ..motion.learned import GraphForecast, read_dynamics
 from ..motion.measures import early_part, half_fit, half_sets
 from ..optics.background import Light
 from ..progress import FitProgress
-from ..ranges import Many, Positive, Seconds, checked_dataclass
+from ..ranges import Positive, Seconds, Within, checked_dataclass
 from ..representations import GaussianCloud, MovingGaussians, MovingSurfaces
 from ..scan import Scan
 from ..tables import read_rows, to_table
@@ -51,7 +51,7 @@ class ForecastOptions:
 
     kind: ClassVar[str] = "forecast"
 
-    times: Many = 10
+    times: Annotated[int, Within(1, MOST_TIMES)] = 10
     """Times ahead."""
     step: Seconds = 0.0
     """Between them [s] (0: the median step of the run)."""
@@ -69,12 +69,6 @@ class ForecastOptions:
     """Factor of the numbers of steps of these fits."""
     flow: Way | None = None
     """How matter in motion goes on (default: the way that tells the last third of the times best)."""
-
-    def __post_init__(self) -> None:
-        require(
-            1 <= self.times <= MOST_TIMES,
-            f"a forecast must be of 1 to {MOST_TIMES} times, but {self.times} are asked for; change --times.",
-        )
 
     @property
     def way(self) -> Forecaster:

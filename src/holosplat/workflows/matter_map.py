@@ -43,15 +43,12 @@ def matter_probabilities(voxels: np.ndarray, matter: np.ndarray) -> np.ndarray:
     which is their weighted least-squares fit (Ayer et al. 1955; as calibration: Zadrozny & Elkan 2002, KDD). Errors:
     `InputError` for counts that differ in length, and for more matter than voxels.
     """
+    from scipy.optimize import isotonic_regression  # which takes long to load
+
     shaped("counts of matter", matter, np.shape(voxels))
     require(bool((matter <= voxels).all()), "voxels of matter must be among those counted, but there are more of them.")
-    joined = list[tuple[float, float, int]]()
-    for one in zip(matter + 0.5, voxels + 1.0, [1] * len(voxels)):
-        while joined and joined[-1][0] * one[1] >= one[0] * joined[-1][1]:
-            before = joined.pop()
-            one = (before[0] + one[0], before[1] + one[1], before[2] + one[2])
-        joined.append(one)
-    return np.repeat([true / every for true, every, _ in joined], [many for *_, many in joined])
+    weights = voxels + 1.0
+    return isotonic_regression((matter + 0.5) / weights, weights=weights).x
 
 
 @dataclass(frozen=True)

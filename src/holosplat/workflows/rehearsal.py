@@ -106,7 +106,7 @@ class Rehearsal:
     @classmethod
     def from_dict(cls, values: Mapping[str, Any], found: Volume | None = None) -> Rehearsal:
         """What `as_dict` described, beside the volume that was `found`; `InputError` for anything else."""
-        try:
+        with as_written("a rehearsal", "what rehearse wrote"):
             total, cause = values["total_m3"], values["cause"]
             return cls(
                 int(values["binned"]),
@@ -120,8 +120,6 @@ class Rehearsal:
                 None if cause is None else Decision.from_dict(cause),
                 {name: float(value) for name, value in values.get("doubts", {}).items()},
             )
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
-            raise InputError(f"a rehearsal must be what rehearse wrote, but it lacks or garbles {error}.") from error
 
     def values(self, name: str) -> np.ndarray:
         """A quantity in all rehearsals, [K] or [K, B]."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -25,6 +25,7 @@ from ..optics.air import Box, find_air, has_air
 from ..optics.background import FLUX, ORDER, Light, LightOptions
 from ..optics.patterns import cosines, mean_light
 from ..progress import Progress
+from ..ranges import Within, checked_dataclass
 from ..representations import Stored
 from ..scan import Scan
 from ..tables import from_table
@@ -86,11 +87,11 @@ FEWEST = 2
 """Least number of training frames: in one frame, light and matter cannot be separated."""
 
 
-@dataclass(frozen=True)
+@checked_dataclass
 class FixedPatternOptions:
     """Options of the estimate of a fixed pattern."""
 
-    order: int
+    order: Annotated[int, Within(0, 32)]
     """Half waves across a frame up to which light changes, such as 4; its mean is taken to be right. 0: any pattern,
     pixel by pixel, which takes views enough for errors of the volume to differ from one to another."""
     inside: float = 0.0
@@ -99,10 +100,6 @@ class FixedPatternOptions:
     """Weight of total variation, as `HolographicTV.misfit`; smooth light only."""
     iterations: int = 300
     """Steps of tomography."""
-
-    def __post_init__(self) -> None:
-        require(0 <= self.order <= 32, f"still light must have 0 to 32 half waves, but it has {self.order}.")
-        require(self.inside >= 0, f"matter must lie within 0 m or more, but it is {self.inside:g} m.")
 
 
 def estimate_fixed_pattern(

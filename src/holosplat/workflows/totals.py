@@ -10,7 +10,7 @@ from typing import Any, Literal, cast
 import numpy as np
 import torch
 
-from ..checks import InputError
+from ..checks import as_written
 from ..fit.residuals import Prediction
 from ..frames import evenly
 from ..geometry import Grid
@@ -62,7 +62,7 @@ class TotalMatter:
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> TotalMatter:
         """The total that `as_dict` described; `InputError` for anything else."""
-        try:
+        with as_written("a total", "what reconstruct wrote"):
             number, error = (
                 (None if (v := values[k]) is None else float(v)) for k in ("value_m3", "standard_error_m3")
             )
@@ -70,8 +70,6 @@ class TotalMatter:
             profile = ProfileErrors.from_dict(values["profile"]) if "profile" in values else None
             held = float(values["held_m3"])
             return cls(quantity, number, error, held, str(values["words"]), profile)
-        except (KeyError, TypeError, ValueError) as fault:
-            raise InputError(f"a total must be what reconstruct wrote, but it lacks or garbles {fault}.") from fault
 
 
 def total_of_run(said: Prediction, frames: Scan, task: Task, constants: tuple[Determined, ...] = ()) -> TotalMatter:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from ..align import find_axis
-from ..checks import InputError
+from ..checks import InputError, as_written
 from ..fit.misfit_diagnosis import Cause, cause_scores, likely_causes
 from ..fit.residuals import Prediction, Residuals, residuals, split_validation
 from ..fit.run import Running
@@ -92,7 +92,7 @@ class Verdict:
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Verdict:
         """The verdict that `as_dict` described; `InputError` for anything else."""
-        try:
+        with as_written("a verdict", "what reconstruct wrote"):
             periods = [[low, math.inf if high is None else high] for low, high in values["periods_m"]]
             return cls(
                 good=bool(values["good"]),
@@ -103,8 +103,6 @@ class Verdict:
                 tested=dict(values["tested"]),
                 cause=str(values.get("cause", "")),
             )
-        except (KeyError, TypeError, ValueError) as error:
-            raise InputError(f"a verdict must be what reconstruct wrote, but it lacks or garbles {error}.") from error
 
 
 LEAVES = (

@@ -8,31 +8,21 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from holosplat.checks import at_least
 from holosplat.optics.propagation import exit_wave_of
-from holosplat.optics.retrieval.model import DARKEST, WaveModel
+from holosplat.optics.retrieval.model import DARKEST, WaveModel, WaveOptions
 from holosplat.optics.retrieval.nonlinear import through_waves
-from holosplat.optics.retrieval.spectra import Noise, check_noise
 from holosplat.progress import Advance
-from holosplat.ranges import checked_dataclass
+from holosplat.ranges import Natural, checked_dataclass
 
 
 @checked_dataclass
-class Projections:
+class Projections(WaveOptions):
     """Options of the alternating projections."""
 
-    iterations: int = 40
+    iterations: Natural = 40
     """Pairs of projections."""
     feedback: float = 0.9
     """Factor of the values that violate the bounds, for hybrid input–output only (Fienup 1982)."""
-    noise: Noise = None
-    """Standard deviation of the frames, or their noise model (default: estimated from them)."""
-    backend: str = "cpu"
-    """Implementation of the wave optics (see `backends`)."""
-
-    def __post_init__(self) -> None:
-        at_least(self, 1, "iterations")
-        check_noise(self.noise)
 
 
 @through_waves(Projections())

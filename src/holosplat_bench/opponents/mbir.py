@@ -14,12 +14,12 @@ from torch import Tensor
 
 from holosplat.baselines import Tomography
 from holosplat.baselines.rays import bounded, in_pixels
-from holosplat.checks import MissingError, at_least, require
+from holosplat.checks import MissingError, require
 from holosplat.geometry import Grid, Views
 from holosplat.methods import PerView
 from holosplat.progress import Advance
 from holosplat.projectors.voxels import rows_match
-from holosplat.ranges import Positive, Signed, checked_dataclass
+from holosplat.ranges import Natural, Positive, Signed, checked_dataclass
 from holosplat.rotations import angles_about_y
 
 
@@ -34,11 +34,8 @@ class Mbir:
     sharpness: Signed = 1.0
     p: Positive = 1.1
     T: Positive = 0.3
-    iterations: int = 20
-    threads: int = 2
-
-    def __post_init__(self) -> None:
-        at_least(self, 1, "iterations", "threads")
+    iterations: Natural = 20
+    threads: Natural = 2
 
 
 def svmbir_volume(

@@ -13,7 +13,7 @@ from torch.nn.functional import max_pool2d
 
 from holosplat.backends import Backend, device, resolve
 from holosplat.baselines import HolographicTV
-from holosplat.checks import at_least, require
+from holosplat.checks import require
 from holosplat.fit.loop import Fit, Plan
 from holosplat.fit.optimiser import Adam, Group, Leaves, Trainable
 from holosplat.fit.problem import Problem, Schedule
@@ -27,7 +27,7 @@ from holosplat.methods.voxels import HolographicStage
 from holosplat.model import Model
 from holosplat.optics.background import Light
 from holosplat.planning.needs import Needs, Sizes, of_grid
-from holosplat.ranges import Rate, Weight, checked_dataclass
+from holosplat.ranges import Natural, Positive, Weight, checked_dataclass
 from holosplat.representations import Stored, VoxelGrid
 from holosplat.scan import Scan
 
@@ -52,9 +52,9 @@ class NeuralFit:
     """The encoding and the network behind it."""
     warmup_steps: int = 80
     """Steps towards the retrieved thickness."""
-    warmup_rays: int = 4096
+    warmup_rays: Natural = 4096
     """Rays of all views in each of them."""
-    rate: Rate = 0.02
+    rate: Positive = 0.02
     """Adam's first rate of all weights, in either stage."""
     shrinkage: Weight = 0.01
     """Weight decay of the encoding."""
@@ -62,7 +62,7 @@ class NeuralFit:
     """Weight of total variation, in voxel edges of thickness."""
     noise_weight: Weight = 0.1
     """What it grows by for every pixel of thickness that the noise of the frames amounts to."""
-    probes: int = 4096
+    probes: Natural = 4096
     """Random pairs of points half a pixel apart on which total variation is measured."""
     hull: Weight = 0.1
     """Share of the largest retrieved thickness that counts as matter: the field lives where all views show matter."""
@@ -82,8 +82,6 @@ class NeuralFit:
     """What computes both stages; `cuda` pays for large fields only."""
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "warmup_rays", "probes")
-        require(self.rate > 0, f"rate must be positive, but it is {self.rate:g}.")
         steps = self.warmup_steps + self.schedule.steps
         require(steps > 0, "a fit needs steps: warmup_steps or schedule.steps must be positive.")
 

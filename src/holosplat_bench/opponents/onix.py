@@ -28,7 +28,7 @@ from holosplat.methods.ground import ExtraTerm, ground
 from holosplat.methods.method import Method, Stage, Task, one_material
 from holosplat.methods.volume import binning
 from holosplat.planning.needs import Costs, Needs, Sizes
-from holosplat.ranges import Natural, Rate, Share, Weight, checked_dataclass
+from holosplat.ranges import Natural, Positive, Share, Weight, checked_dataclass
 from holosplat.representations import Stored
 from holosplat.scan import Scan
 
@@ -60,13 +60,13 @@ class AlignedFit:
     """File of weights that `holosplat train --network` wrote (default: none; all is learnt from the scan's frames)."""
     network: AlignedNetwork = field(default_factory=AlignedNetwork)
     """How large the network is where no weights are given."""
-    rate: Rate = 0.005
+    rate: Positive = 0.005
     """Adam's first rate of all weights."""
     weight: Weight = 0.01
     """Weight of total variation, in voxel edges of thickness."""
     noise_weight: Weight = 0.1
     """What it grows by for every pixel of thickness that the noise of the frames amounts to."""
-    smoothing: float = 0.005
+    smoothing: Positive = 0.005
     """Differences between voxels below which total variation is a square."""
     hull: Share = 0.1
     """Share of the largest thickness that counts as matter: the field lives where all views show some."""
@@ -82,8 +82,6 @@ class AlignedFit:
     """Further terms by name."""
 
     def __post_init__(self) -> None:
-        require(self.rate > 0, f"rate must be positive, but it is {self.rate:g}.")
-        require(self.smoothing > 0, f"smoothing must be positive, but it is {self.smoothing:g}.")
         require(
             self.schedule.validation_views == 0,
             "a pixel-aligned field sees all training frames, so that none validates: validation_views must be 0, but "

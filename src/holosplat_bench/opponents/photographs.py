@@ -16,7 +16,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from holosplat.checks import at_least, require
+from holosplat.checks import require
 from holosplat.fit.density import DensityControl, DensityEvent
 from holosplat.fit.loop import Fit, Plan, Stateless
 from holosplat.fit.optimiser import Adam, Trainable
@@ -30,7 +30,7 @@ from holosplat.methods.ground import ground
 from holosplat.methods.method import Method, Stage, Task
 from holosplat.model import Instrument, Model
 from holosplat.optics.retrieval import paganin
-from holosplat.ranges import Rate, Share, checked_dataclass
+from holosplat.ranges import Natural, Positive, Rate, Share, checked_dataclass
 from holosplat.representations import Stored
 from holosplat.scan import Scan
 
@@ -68,7 +68,7 @@ class AlphaSplats(Method):
 
     kind: ClassVar[str] = "alpha-3dgs"
 
-    start_per_pixel: float = 0.2
+    start_per_pixel: Positive = 0.2
     """Gaussians at the start for each pixel of a frame, uniform in the ball that every view sees."""
     similarity: Share = 0.2
     """Share of 1 - SSIM in the loss, beside the mean absolute difference (0.2 as published)."""
@@ -83,9 +83,6 @@ class AlphaSplats(Method):
     """Steps between resets of all opacities (0: never)."""
     reset_to: Share = 0.01
     """Opacity that is left then, at most (0.01 as published)."""
-
-    def __post_init__(self) -> None:
-        require(self.start_per_pixel > 0, f"start_per_pixel must be positive, but it is {self.start_per_pixel:g}.")
 
     @property
     def wants_levels(self) -> bool:
@@ -164,15 +161,12 @@ class RadianceFields(Method):
 
     network: Network = field(default_factory=_network)
     """Waves whose periods halve down to about 2 pixels, and three layers of 64 units behind them."""
-    rays: int = 256
+    rays: Natural = 256
     """Rays of all frames in a step."""
     rate: Rate = 0.005
     """Adam's first rate of all weights."""
     schedule: Schedule = field(default_factory=lambda: Schedule(1000, decay=0.1, oversample=1))
     """Steps; they look at rays of all frames."""
-
-    def __post_init__(self) -> None:
-        at_least(self, 1, "rays")
 
     @property
     def wants_levels(self) -> bool:

@@ -10,7 +10,7 @@ from typing import ClassVar
 import torch
 
 from holosplat.baselines import HolographicTV, holographic_tv
-from holosplat.checks import at_least, require
+from holosplat.checks import require
 from holosplat.fit.loop import Fit, Plan
 from holosplat.fit.optimiser import Adam
 from holosplat.fit.problem import Problem, Schedule, Term
@@ -21,7 +21,7 @@ from holosplat.methods.ground import ExtraTerm, Ground, ground
 from holosplat.methods.method import Method, Stage, Task, one_material
 from holosplat.planning.acts import Parts
 from holosplat.planning.needs import Costs, Needs, Sizes, of_start
-from holosplat.ranges import Rate, Weight, checked_dataclass
+from holosplat.ranges import Natural, Positive, Weight, checked_dataclass
 from holosplat.representations import Stored
 
 from .fields import SpaceTime, SpaceTimeField
@@ -49,17 +49,17 @@ class PinnFit:
     """The splines of the matter and the network of the velocity."""
     equations: Equations = field(default_factory=Equations)
     """What binds the two."""
-    rate: Rate = 0.05
+    rate: Positive = 0.05
     """Adam's first rate of the coefficients of the matter, logarithms of odds."""
-    flow_rate: Rate = 0.01
+    flow_rate: Positive = 0.01
     """The same of the velocity's weights."""
-    flow_steps: int = 150
+    flow_steps: Natural = 150
     """Steps of the velocity alone, beside the matter of each time by itself."""
     weight: Weight = 0.05
     """Weight of total variation, in voxel edges of thickness."""
     noise_weight: Weight = 0.03
     """What it grows by for every pixel of thickness that the noise of the frames amounts to."""
-    smoothing: float = 0.005
+    smoothing: Positive = 0.005
     """Differences between voxels below which total variation is a square."""
     objective: Objective = field(default_factory=lambda: Objective(l1=0.0, spectral=1.0, floor=0.1))
     """How frames are compared."""
@@ -67,12 +67,6 @@ class PinnFit:
     """Of the stage through the waves."""
     terms: tuple[ExtraTerm, ...] = ()
     """Further terms by name, through the waves."""
-
-    def __post_init__(self) -> None:
-        at_least(self, 1, "flow_steps")
-        require(self.smoothing > 0, f"smoothing must be positive, but it is {self.smoothing:g}.")
-        for name in ("rate", "flow_rate"):
-            require(getattr(self, name) > 0, f"{name} must be positive, but it is {getattr(self, name):g}.")
 
 
 @dataclass(frozen=True)

@@ -11,15 +11,15 @@ import re
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
-from holosplat.checks import InputError, in_range, require, whole_seed
+from holosplat.checks import InputError, require, whole_seed
 from holosplat.geometry import rotation_y
 from holosplat.io.vtk import SUFFIXES, read_meshes
 from holosplat.matter import DeltaBeta
-from holosplat.ranges import Many, ManyOrNone, Metres, Small, checked_dataclass
+from holosplat.ranges import Many, ManyOrNone, Metres, Small, Within, checked_dataclass
 from holosplat.scan import Exposures, interleaved_split
 from holosplat.specimens.continuous import ContinuousScene
 from holosplat.specimens.repair import closed
@@ -163,10 +163,7 @@ class Snapshots(MeshedKind):
     """
 
     kind: ClassVar[str] = "snapshots"
-    scale: float = 1.0
-
-    def __post_init__(self) -> None:
-        in_range("scale", self.scale, 1e-3, 1e3)
+    scale: Annotated[float, Within(1e-3, 1e3)] = 1.0
 
     def bodies(self, seed: int, snapshots: Path | None) -> Bodies:
         """The cells of the snapshot that `seed` gives, closed, about the middle of their bounding box."""

@@ -13,14 +13,14 @@ from typing import Literal
 
 import numpy as np
 
-from holosplat.checks import InputError, at_least, require
+from holosplat.checks import InputError, require
 from holosplat.fit.density import DensityControl
 from holosplat.fit.problem import Schedule
 from holosplat.fit.terms import Objective
 from holosplat.methods import FitOptions
 from holosplat.methods.gaussian_options import GaussianRates
 from holosplat.methods.presets import preset
-from holosplat.ranges import checked_dataclass
+from holosplat.ranges import Natural, checked_dataclass
 from holosplat.scan import Scan
 from holosplat.volume import Object, Volume
 
@@ -109,8 +109,8 @@ class Configuration:
     """
 
     name: str
-    count: int = 8_000
-    views: int = 4
+    count: Natural = 8_000
+    views: Natural = 4
     position_rate: float = 1.6e-4
     shape_rate: float = 1e-3
     amplitude_rate: float = 0.01
@@ -119,10 +119,6 @@ class Configuration:
     variation: Literal["frames", "volume"] = "frames"
     all_learn: bool = False
     one_unit: bool = False
-
-    def __post_init__(self) -> None:
-        at_least(self, 1, "count", "views")
-        at_least(self, 0, "position_rate", "shape_rate", "amplitude_rate", "threshold", "faint")
 
 
 THESIS_TABLE = (

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import field
-from typing import Literal
+from typing import Annotated, Literal
 
-from holosplat.checks import at_least, require
+from holosplat.checks import require
 from holosplat.geometry import Views
 from holosplat.learning.network import Size
 from holosplat.ranges import (
+    MOST,
     Angle,
     Many,
     Natural,
@@ -20,6 +21,7 @@ from holosplat.ranges import (
     Share,
     SomeShare,
     Weight,
+    Within,
     checked_dataclass,
 )
 from holosplat.scan import Exposures
@@ -37,11 +39,11 @@ class Ranges:
     kinds: tuple[Kind, ...] = ("red-cells",)
     """What scenes are made of, each kind as often as the others; crowd: red cells as close as they can be; capsules:
     shells about nothing; filled-capsules: about another material; soft-cells: continuous, with nuclei and vacuoles."""
-    rows: Natural = 80
+    rows: Annotated[int, Within(16, MOST)] = 80
     """Of a frame [pixels]."""
-    columns: Natural = 80
+    columns: Annotated[int, Within(16, MOST)] = 80
     """Of a frame [pixels]."""
-    views: Many = 6
+    views: Annotated[int, Within(2, 10**5)] = 6
     """Frames with noise, for training."""
     held_out: Many = 2
     """Frames without noise, which show how well others are predicted."""
@@ -85,8 +87,6 @@ class Ranges:
     """Standard deviation of unknown shifts of each view [pixels], evenly; none by default."""
 
     def __post_init__(self) -> None:
-        at_least(self, 16, "rows", "columns")
-        at_least(self, 2, "views")
         require(len(self.kinds) > 0, "kinds must name at least one kind of specimen, but it is empty; give one.")
         for name, pair in vars(self).items():
             if name != "kinds" and isinstance(pair, tuple):
@@ -176,9 +176,6 @@ class TrainOptions:
     from frames alone, or that of `forecast --by graph`, on series of grow; these are of one size."""
     frames: FrameLossWeights = field(default_factory=FrameLossWeights)
     """The training loss of networks that learn from frames alone."""
-
-    def __post_init__(self) -> None:
-        at_least(self, 1, "steps")
 
     def rate_at(self, step: int) -> float:
         """The rate of the step number `step`, from 0."""

@@ -172,9 +172,9 @@ def test_what_does_not_fit_is_refused(scan):
     with pytest.raises(InputError, match="training frames of 2 times or more"):
         each_time(scan.at_instant(0), KNOWN, HolographicVoxels(VOLUME))
     for options in (TimesFit, SpaceTimeFit):
-        with pytest.raises(InputError, match="smoothing must be positive"):
+        with pytest.raises(InputError, match="smoothing must be a positive number"):
             options(smoothing=0.0)
-    with pytest.raises(InputError, match=r"decay must lie in \(0, 1\]"):
+    with pytest.raises(InputError, match=r"decay must be a positive number"):
         TimesFit(decay=0.0)
     with pytest.raises(InputError, match="rank must be at least 1"):
         LowRank(rank=0)

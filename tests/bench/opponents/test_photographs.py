@@ -76,5 +76,5 @@ def test_wave_optics_explains_nothing_of_photographs(scan):
 
 
 def test_splats_need_a_start():
-    with pytest.raises(hs.InputError, match="start_per_pixel must be positive"):
+    with pytest.raises(hs.InputError, match="start_per_pixel must be a positive number"):
         AlphaSplats(start_per_pixel=0.0)

@@ -21,7 +21,6 @@ from .spectra import (
     Prior,
     Raster,
     absorption,
-    check_noise,
     checked,
     column,
     detector_transfer,
@@ -53,9 +52,6 @@ class Linear:
     """Part of the frames' contrast that no filter explains; it damps frequencies where the response is weak."""
     prior: Prior = SHARP_EDGED
     """Expected power of the phase."""
-
-    def __post_init__(self) -> None:
-        check_noise(self.noise)
 
 
 @or_in_contact

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Protocol
 
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, pad
 
 from ...backends import device, resolve
-from ...checks import at_least
 from ...progress import Advance
-from ...ranges import Weight, checked_dataclass
+from ...ranges import Natural, Weight, checked_dataclass
 from ...scan import Exposures
 from ...units import wavelength
 from ..hologram import hologram, optical_path
@@ -25,7 +23,6 @@ from .spectra import (
     Prior,
     Raster,
     absorption,
-    check_noise,
     checked,
     column,
     filtered,
@@ -46,39 +43,27 @@ CROSS_TERM = 4.0
 
 
 @checked_dataclass
-class Regularised:
-    """Options of the fits through the wave optics."""
+class WaveOptions:
+    """Options of any retrieval through the wave optics."""
 
-    iterations: int = 60
-    """Steps, each one evaluation of the wave optics and its gradient."""
-    weight: Weight = 1.0
-    """Weight of the regularisation; 1 is the Bayesian weight under the method's assumptions on the matter."""
     noise: Noise = None
     """Standard deviation of the frames, or their noise model (default: estimated from them)."""
     backend: str = "cpu"
     """Implementation of the wave optics (see `backends`)."""
+
+
+@checked_dataclass
+class Regularised(WaveOptions):
+    """Options of the fits through the wave optics."""
+
+    iterations: Natural = 60
+    """Steps, each one evaluation of the wave optics and its gradient."""
+    weight: Weight = 1.0
+    """Weight of the regularisation; 1 is the Bayesian weight under the method's assumptions on the matter."""
     leaves: Leaves = NOWHERE
     """Whether matter goes on above and below the frames, and at their sides (`bounded_estimate`)."""
     prior: Prior | None = None
     """Expected power of the phase (default: the one that the frames show)."""
-
-    def __post_init__(self) -> None:
-        at_least(self, 1, "iterations")
-        check_noise(self.noise)
-
-
-class WaveOptions(Protocol):
-    """Options of any retrieval through the wave optics."""
-
-    @property
-    def noise(self) -> Noise:
-        """Standard deviation of the frames, or their noise model."""
-        ...
-
-    @property
-    def backend(self) -> str:
-        """Implementation of the wave optics."""
-        ...
 
 
 class WaveModel:

@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from ...checks import at_least, finite, require, shaped
-from ...ranges import Weight, checked_dataclass
+from ...checks import finite, require, shaped
+from ...ranges import LARGEST, Within, checked_dataclass
 from ...scan import Exposures
 from ...units import wavelength, wavenumber
 from ..noise import NoiseModel, noise_levels, with_gaps
@@ -39,13 +40,10 @@ class Prior:
     Projected bodies with sharp edges fall off as f⁻³ to f⁻⁴, and are level below the frequency that their size sets.
     """
 
-    corner: Weight = 3.0
+    corner: Annotated[float, Within(0.1, LARGEST)] = 3.0
     """Frequency below which the power is level [cycles per field of view]."""
-    decay: Weight = 2.0
+    decay: Annotated[float, Within(0.1, LARGEST)] = 2.0
     """Half the exponent of the fall-off."""
-
-    def __post_init__(self) -> None:
-        at_least(self, 0.1, "corner", "decay")
 
 
 def checked(frames: Tensor | np.ndarray, exposures: Exposures, delta: float) -> Tensor:
@@ -277,12 +275,6 @@ def _levels(frames: Tensor, exposures: Exposures, raster: Raster, noise: Noise) 
 def part_of(noise: Noise, index: np.ndarray) -> Noise:
     """The noise of some of the frames."""
     return noise[index] if isinstance(noise, NoiseModel) else noise
-
-
-def check_noise(noise: Noise) -> None:
-    """`InputError` for a negative standard deviation."""
-    if isinstance(noise, float | int):
-        require(noise >= 0, f"noise must not be negative, but it is {noise}.")
 
 
 def filtered(images: Tensor, factor: Tensor) -> Tensor:

@@ -82,7 +82,7 @@ def splat(
     if sources is not None:
         inclined = _obliquity(shifts, sources, shape)  # type: ignore[arg-type]
         factors = inclined if factors is None else factors * inclined
-    lines = run(*cloud, rotations, shifts, None if sources is None else 1 / sources, *spread)
+    lines = run(cloud, (rotations, shifts, None if sources is None else 1 / sources), *spread)
     return lines if factors is None else lines * factors.to(lines)
 
 
@@ -118,7 +118,7 @@ def voxelise(
         _check_cloud(backend, *cloud)
         _check_raster("volume shape", shape, "three positive counts (Z, Y, X)", 3)
         _check_spread(cutoff, "voxel_variance", voxel_variance)
-    return run(*cloud, _counts(shape), float(cutoff), float(voxel_variance))
+    return run(cloud, _counts(shape), float(cutoff), float(voxel_variance))
 
 
 def _check_cloud(backend: str, centres: Tensor, scales: Tensor, quaternions: Tensor, amplitudes: Tensor) -> None:

@@ -13,56 +13,45 @@ the input's type, so that twins of lower precision draw the very same pixels; bo
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 
 def splat(
-    centres: Tensor,
-    scales: Tensor,
-    quaternions: Tensor,
-    amplitudes: Tensor,
-    rotations: Tensor,
-    shifts: Tensor,
-    curvatures: Tensor | None,
-    shape: tuple[int, ...],
-    cutoff: float,
-    pixel_variance: float,
+    cloud: Sequence[Tensor], poses: Sequence[Tensor | None], shape: tuple[int, ...], cutoff: float, variance: float
 ) -> Tensor:
     """Line integrals [V, C, H, W]; arguments and units as the package's `splat`, already checked.
 
-    curvatures: [V], one over the distances of sources (None: parallel beams); integrals along depth, not along rays.
+    poses: with curvatures [V], one over the distances of sources (None: parallel beams); integrals along depth, not
+    along rays.
     """
+    (centres, scales, quaternions, amplitudes), (rotations, shifts, curvatures) = cloud, poses
+    assert rotations is not None
+    assert shifts is not None
     mass = (2 * math.pi) ** 1.5 * scales.prod(1, keepdim=True) * amplitudes
     images = [amplitudes.new_zeros((0, amplitudes.shape[1], *shape))]
     bent = [None] * len(rotations) if curvatures is None else curvatures
     for pose in zip(rotations, shifts, bent):
         mean, covariance, area = _projected(centres, scales, quaternions, *pose)
-        covariance = covariance + pixel_variance * torch.eye(2).to(covariance)
+        covariance = covariance + variance * torch.eye(2).to(covariance)
         with torch.no_grad():
             exact = _projected(centres.double(), scales.double(), quaternions.double(), *pose)
-            low, high = boxes(*exact[:2], shape, cutoff, pixel_variance)
+            low, high = boxes(*exact[:2], shape, cutoff, variance)
         peak = area[:, None] * mass / (2 * math.pi * torch.linalg.det(covariance).sqrt()[:, None])
         images.append(_draw(mean, covariance, peak, low, high, shape)[None])
     return torch.cat(images)
 
 
-def voxelise(
-    centres: Tensor,
-    scales: Tensor,
-    quaternions: Tensor,
-    amplitudes: Tensor,
-    shape: tuple[int, ...],
-    cutoff: float,
-    voxel_variance: float,
-) -> Tensor:
+def voxelise(cloud: Sequence[Tensor], shape: tuple[int, ...], cutoff: float, variance: float) -> Tensor:
     """Samples [C, Z, Y, X]; arguments and units as the package's `voxelise`, already checked."""
+    centres, scales, quaternions, amplitudes = cloud
     axes = rotation_matrices(quaternions) * scales[:, None]
-    covariance = axes @ axes.mT + voxel_variance * torch.eye(3).to(axes)
+    covariance = axes @ axes.mT + variance * torch.eye(3).to(axes)
     with torch.no_grad():
         exact = rotation_matrices(quaternions.double()) * scales.double()[:, None]
-        low, high = boxes(centres.double(), exact @ exact.mT, shape, cutoff, voxel_variance)
+        low, high = boxes(centres.double(), exact @ exact.mT, shape, cutoff, variance)
     # sqrt(det Σ) is the product of the scales: a determinant would lose thin Gaussians to rounding.
     peak = amplitudes * (scales.prod(1) / torch.linalg.det(covariance).sqrt())[:, None]
     return _draw(centres, covariance, peak, low, high, shape)

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 from torch.nn.functional import embedding_bag, grid_sample, interpolate, leaky_relu
 
-from holosplat.checks import at_least, require
+from holosplat.checks import require
 from holosplat.ranges import Natural, checked_dataclass
 
 MOST_LEVELS = 10
@@ -46,7 +46,6 @@ class AlignedNetwork:
     def __post_init__(self) -> None:
         count = len(self.image)
         require(1 < count <= MOST_LEVELS, f"image must have 2 to {MOST_LEVELS} levels, but it has {count}.")
-        at_least(self, 0, "octaves")
 
 
 class PixelAligned(nn.Module):

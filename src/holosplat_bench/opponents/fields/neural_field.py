@@ -16,11 +16,11 @@ from torch.func import functional_call
 from torch.nn.functional import max_pool3d, softplus
 
 from holosplat.backends import device
-from holosplat.checks import at_least, require, require_shapes
+from holosplat.checks import require, require_shapes
 from holosplat.display import of_object
 from holosplat.geometry import Grid, Poses, Views
 from holosplat.matter import Matter
-from holosplat.ranges import checked_dataclass
+from holosplat.ranges import Natural, checked_dataclass
 from holosplat.representations.voxels import resampling
 from holosplat.tables import from_table, to_table
 from holosplat.volume import LineIntegrals, Unmoved, Volume
@@ -40,11 +40,8 @@ class Network:
     """Options of the network: the encoding, and `layers` hidden layers of `hidden` units (ReLU) behind it."""
 
     encoding: Encoding = field(default_factory=Encoding)
-    hidden: int = 32
-    layers: int = 2
-
-    def __post_init__(self) -> None:
-        at_least(self, 1, "hidden", "layers")
+    hidden: Natural = 32
+    layers: Natural = 2
 
 
 @dataclass(frozen=True)

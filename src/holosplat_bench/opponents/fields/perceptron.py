@@ -11,14 +11,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from itertools import pairwise
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import embedding_bag, grid_sample
 
-from holosplat.checks import at_least, require
-from holosplat.ranges import Weight, checked_dataclass
+from holosplat.checks import require
+from holosplat.ranges import MOST, Natural, Positive, Within, checked_dataclass
 
 OUTPUTS = 4
 """Three of the velocity, or of its potential, and the pressure."""
@@ -75,13 +75,10 @@ class VelocityNetwork:
     solenoidal: bool = True
     """Whether the velocity is the curl of a potential, which has no divergence whatever the weights; else its three
     components are free."""
-    hidden: int = 32
+    hidden: Natural = 32
     """Units (tanh) of a hidden layer: flows of a channel are smooth."""
-    layers: int = 2
+    layers: Natural = 2
     """Hidden layers."""
-
-    def __post_init__(self) -> None:
-        at_least(self, 1, "hidden", "layers")
 
     def started(self, seed: int) -> dict[str, Tensor]:
         """Weights at first, after Glorot and Bengio (2010), float32: `weight0`, `bias0`, … of the layers."""
@@ -147,23 +144,19 @@ class Encoding:
     """
 
     kind: Literal["hash", "fourier", "octaves"] = "hash"
-    levels: int = 4
-    features: int = 4
+    levels: Natural = 4
+    features: Natural = 4
     coarsest: float = 16.0
     finest: float = 1.5
-    log2_size: int = 17
-    waves: int = 64
-    bandwidth: Weight = 0.06
+    log2_size: Annotated[int, Within(4, MOST)] = 17
+    waves: Natural = 64
+    bandwidth: Positive = 0.06
 
     def __post_init__(self) -> None:
-        require(self.kind in ENCODINGS, f"kind must be one of {', '.join(ENCODINGS)}, but it is {self.kind!r}.")
-        at_least(self, 1, "levels", "features", "waves")
-        at_least(self, 4, "log2_size")
         require(
             0 < self.finest <= self.coarsest,
             f"finest must lie between 0 and coarsest = {self.coarsest:g}, but it is {self.finest:g}.",
         )
-        require(self.bandwidth > 0, f"bandwidth must be positive, but it is {self.bandwidth:g}.")
 
     def build(self, extent: float, generator: torch.Generator) -> HashGrid | FourierWaves:
         """The encoding of positions in a box whose longest edge is `extent` [pixels]."""

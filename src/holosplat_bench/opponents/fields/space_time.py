@@ -13,11 +13,11 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 from holosplat.backends import in_main_memory
-from holosplat.checks import positive, require, require_shapes
+from holosplat.checks import require, require_shapes
 from holosplat.display import of_object
 from holosplat.geometry import Grid, Poses, Views
 from holosplat.matter import Matter
-from holosplat.ranges import Pixels, checked_dataclass
+from holosplat.ranges import Positive, checked_dataclass
 from holosplat.representations.flow import Lattice, TimeBasis
 from holosplat.representations.voxels import VoxelGrid, along_axes
 from holosplat.tables import from_table, to_table
@@ -37,7 +37,7 @@ EMPTIEST = 0.01
 class SpaceTime:
     """Options of the field."""
 
-    cell_px: Pixels = 2.0
+    cell_px: Positive = 2.0
     """Distance of the nodes of the occupancy's splines in space [voxel edges]."""
     degree: int = 2
     """Of its splines of time."""
@@ -45,9 +45,6 @@ class SpaceTime:
     """Of these (0: as many coefficients as times)."""
     velocity: VelocityNetwork = field(default_factory=VelocityNetwork)
     """The network of the velocity."""
-
-    def __post_init__(self) -> None:
-        positive("cell_px", self.cell_px, "voxel edges")
 
     def basis(self, times: np.ndarray) -> TimeBasis:
         """The splines of `times` [T] [s]."""

@@ -19,13 +19,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from holosplat.checks import at_least
 from holosplat.fit.problem import FIXED, Batch, LossPart
 from holosplat.fit.terms import FrameTerm
 from holosplat.fit.total_variation import total_variation
 from holosplat.geometry import Views
 from holosplat.model import Model
-from holosplat.ranges import Small, Weight, checked_dataclass
+from holosplat.ranges import Natural, Small, Weight, checked_dataclass
 from holosplat.representations import VoxelGrid
 
 from .neural_field import NeuralField, Samples, uniform
@@ -154,13 +153,10 @@ class Equations:
     next]."""
     viscosity: Small | None = None
     """Kinematic viscosity ν [m²/s], with which inertia counts (Navier and Stokes); without, it does not (Stokes)."""
-    points: int = 1024
+    points: Natural = 1024
     """Random places of a step, all at one random time, for continuity."""
-    momentum_points: int = 128
+    momentum_points: Natural = 128
     """The same for momentum, whose derivatives are of third order."""
-
-    def __post_init__(self) -> None:
-        at_least(self, 1, "points", "momentum_points")
 
     def reynolds(self, frame: Frame) -> float:
         """Re of a field; 0 without a viscosity."""

@@ -14,13 +14,13 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from holosplat.baselines import HolographicTV, holographic_tv
-from holosplat.checks import at_least, positive, require_shapes
+from holosplat.checks import require_shapes
 from holosplat.fit.loop import Fit
 from holosplat.geometry import Grid
 from holosplat.matter import Matter
 from holosplat.methods.cross_validation import assumed_material
 from holosplat.methods.method import Method, Stage, Task, quiet
-from holosplat.ranges import Pixels, Rate, Weight, checked_dataclass
+from holosplat.ranges import Natural, Pixels, Positive, Rate, Weight, checked_dataclass
 from holosplat.representations import Stored, VoxelGrid
 from holosplat.representations.voxels import along_axes
 from holosplat.tables import from_table, to_table
@@ -38,26 +38,21 @@ NETWORK = "network."
 class Deformation:
     """Options of the network and of the canonical voxels."""
 
-    layers: int = 3
+    layers: Natural = 3
     """Layers of rectified units (eight as published, for scenes of many parts)."""
-    hidden: int = 64
+    hidden: Natural = 64
     """Units of a layer (256 as published)."""
     place_frequencies: int = 4
     """Octaves of sines and cosines of the place, from half a wave over the field on (ten as published: finer ones let
     parts of a pixel move by themselves)."""
     time_frequencies: int = 2
     """The same of the time (four as published)."""
-    cell_px: Pixels = 4.0
+    cell_px: Positive = 4.0
     """Distance of the places at which the network is asked [voxel edges]; between them displacements are linear."""
     beyond_px: Pixels = 24.0
     """Canonical voxels beyond the field on every side [voxel edges], from which matter enters."""
-    reach_px: Pixels = 10.0
+    reach_px: Positive = 10.0
     """Displacement of an output of one [voxel edges], from the middle of the times to their ends."""
-
-    def __post_init__(self) -> None:
-        positive("cell_px", self.cell_px, "voxel edges")
-        positive("reach_px", self.reach_px, "voxel edges")
-        at_least(self, 1, "layers", "hidden")
 
     @property
     def margin(self) -> int:

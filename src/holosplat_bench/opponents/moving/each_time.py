@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from holosplat.baselines import HolographicTV, holographic_tv
-from holosplat.checks import InputError, at_least, require
+from holosplat.checks import InputError, require
 from holosplat.fit.loop import Fit, Plan
 from holosplat.fit.problem import Problem, Schedule
 from holosplat.fit.projected_gradient import ProjectedGradient
@@ -23,7 +23,7 @@ from holosplat.methods.illumination import prepared
 from holosplat.methods.method import Method, Stage, Task, finished, quiet, solve_stages
 from holosplat.methods.solve import settled
 from holosplat.progress import Progress
-from holosplat.ranges import Weight, checked_dataclass
+from holosplat.ranges import Natural, Positive, Weight, checked_dataclass
 from holosplat.representations import Stored
 from holosplat.scan import Scan
 
@@ -145,7 +145,7 @@ class EachTime(Method):
 class SpaceTimeFit:
     """Options of voxels of all times and their fit."""
 
-    steps: int = 60
+    steps: Natural = 60
     """Evaluations of the wave model of all frames and its gradient, as voxels of one time have."""
     weight: Weight = 0.05
     """Weight of total variation, in voxel edges of thickness, as voxels of one time have it."""
@@ -155,14 +155,10 @@ class SpaceTimeFit:
     pace: Weight = 2.0
     """What a change from one time to the next counts beside one from a voxel to the next (0: times are apart); 0 to 1
     left more noise on the tuning snapshots."""
-    smoothing: float = 0.005
+    smoothing: Positive = 0.005
     """Changes below which total variation is a square."""
     objective: Objective = field(default_factory=spectral_objective)
     """How frames are compared."""
-
-    def __post_init__(self) -> None:
-        at_least(self, 1, "steps")
-        require(self.smoothing > 0, f"smoothing must be positive, but it is {self.smoothing:g}.")
 
 
 @dataclass(frozen=True)

@@ -13,13 +13,13 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 from holosplat.baselines import HolographicTV
-from holosplat.checks import at_least, positive, require, require_shapes
+from holosplat.checks import require, require_shapes
 from holosplat.fit.loop import Fit
 from holosplat.geometry import Grid
 from holosplat.matter import Matter
 from holosplat.methods.cross_validation import assumed_material
 from holosplat.methods.method import Method, Stage, Task
-from holosplat.ranges import Pixels, Rate, Share, Weight, checked_dataclass
+from holosplat.ranges import Natural, Positive, Rate, Share, Weight, checked_dataclass
 from holosplat.representations import Stored, VoxelGrid
 from holosplat.tables import from_table, to_table
 
@@ -36,11 +36,11 @@ TIME_PLANES = tuple(second for _, second in PAIRS)
 class HexPlanes:
     """Options of the field."""
 
-    features: int = 16
+    features: Natural = 16
     """Features of each plane (24 to 48 as published, for scenes of many colours)."""
-    hidden: int = 16
+    hidden: Natural = 16
     """Units of the decoder's one layer."""
-    cell_px: Pixels = 1.0
+    cell_px: Positive = 1.0
     """Distance of the nodes of the planes in space [voxel edges]."""
     time_nodes: int = 0
     """Nodes of the planes in time (0: as many as times)."""
@@ -48,8 +48,6 @@ class HexPlanes:
     """Occupancy everywhere, about, with which a fit begins: matter is rare in most fields."""
 
     def __post_init__(self) -> None:
-        positive("cell_px", self.cell_px, "voxel edges")
-        at_least(self, 1, "features", "hidden")
         require(0 < self.empty < 1, f"empty must lie between 0 and 1, but it is {self.empty:g}.")
 
     def nodes(self, cells: int) -> int:
@@ -268,7 +266,7 @@ class LowRank(Method):
 
     volume: HolographicTV = field(default_factory=usual_start)
     """The start: each time by itself, of which the nearest matter of low rank is taken."""
-    rank: int = 8
+    rank: Natural = 8
     """Volumes (at most as many as times)."""
     rate: Rate = 0.003
     """Adam's first rate of the volumes, whose courses have a mean square of one."""
@@ -276,9 +274,6 @@ class LowRank(Method):
     """The same of the courses."""
     fit: TimesFit = field(default_factory=TimesFit)
     """The fit through the waves."""
-
-    def __post_init__(self) -> None:
-        at_least(self, 1, "rank")
 
     def stages(self) -> Sequence[Stage]:
         """Each time by itself, and the fit."""

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from holosplat.checks import at_least, require
+from holosplat.checks import require
 from holosplat.fit.loop import Fit, Plan
 from holosplat.fit.optimiser import Adam
 from holosplat.fit.problem import Batch, LossPart, Problem, Schedule
@@ -20,7 +20,7 @@ from holosplat.fit.total_variation import total_variation
 from holosplat.methods.ground import Ground, ground
 from holosplat.methods.method import Task
 from holosplat.model import Model
-from holosplat.ranges import Share, Weight, checked_dataclass
+from holosplat.ranges import Natural, Positive, Share, SomeShare, Weight, checked_dataclass
 from holosplat.representations import Stored, VoxelGrid
 from holosplat.scan import Scan
 from holosplat.volume import Object
@@ -35,14 +35,11 @@ VOLUMES = "object.volumes"
 class DrawnTimes:
     """Which times a step looks at."""
 
-    count: int = 1
+    count: Natural = 1
     """Times of a step, with all their frames: memory is that of so many."""
     opening: Share = 0.0
     """Share of the steps in which the times that are drawn from grow from those in the middle to all (0: all from the
     first step on)."""
-
-    def __post_init__(self) -> None:
-        at_least(self, 1, "count")
 
     def among(self, times: int, progress: float) -> tuple[int, int]:
         """First time that is drawn from, and the one after the last, of so many at a `progress` from 0 to 1."""
@@ -250,9 +247,9 @@ def spectral_objective() -> Objective:
 class TimesFit:
     """How a field of space and time is fitted to the frames."""
 
-    steps: int = 400
+    steps: Natural = 400
     """Steps of Adam."""
-    decay: float = 0.1
+    decay: SomeShare = 0.1
     """Share of the rates that is left at the last step (exponential in between)."""
     drawn: DrawnTimes = field(default_factory=DrawnTimes)
     """Which times a step looks at."""
@@ -261,15 +258,10 @@ class TimesFit:
     noise_weight: Weight = 0.03
     """What it grows by for every pixel of thickness that the noise of the frames amounts to, for matter with levels;
     for other matter it falls with noise (`weight_of`)."""
-    smoothing: float = 0.005
+    smoothing: Positive = 0.005
     """Differences between voxels below which total variation is a square."""
     objective: Objective = field(default_factory=spectral_objective)
     """How frames are compared."""
-
-    def __post_init__(self) -> None:
-        at_least(self, 1, "steps")
-        require(self.smoothing > 0, f"smoothing must be positive, but it is {self.smoothing:g}.")
-        require(0 < self.decay <= 1, f"decay must lie in (0, 1], but it is {self.decay:g}.")
 
 
 def weight_of(base: Ground, weight: float, noise_weight: float, bounded: bool) -> float:
