@@ -241,7 +241,7 @@ def test_every_variant_of_surfaces_changes_something(scripts):
     assert found.pop("as they are") == (surfaces.SurfaceFit(), None, None)
     assert (surfaces.SurfaceFit(), None, None) not in found.values()
     assert found["40 steps"][0].schedule.steps == 40
-    assert found["no smoothness"][0].objective.bending == 0
+    assert found["no smoothness"][0].curvature == 0
 
 
 def test_what_cases_of_learned_starts_are_told(scripts):
