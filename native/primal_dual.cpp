@@ -5,28 +5,34 @@
 #include <cmath>
 
 #include "abi.hpp"
+#include "simd.hpp"
 #include "threads.hpp"
 
 namespace {
 
-// One row of the gradient's dual variable: q += step * forward difference, then onto the ball of `radius`.
-// `down` and `side` are the neighbouring rows along the two slower axes, null at the border (difference 0).
-void ascend_row(int64_t n, const float* u, const float* down, const float* side, float* q0, float* q1, float* q2,
-                float step, float radius) {
+// By value: of the references of std::max, and of rows that might overlap, compilers make no vectors.
+HOLO_INLINE float larger(float a, float b) { return a < b ? b : a; }
+
+// One voxel of the gradient's dual variable: q += step * forward difference, then onto the ball of `radius`.
+HOLO_INLINE void ascend(float* q0, float* q1, float* q2, float down, float side, float along, float step,
+                        float radius) {
+  const float a = *q0 + step * down, b = *q1 + step * side, c = *q2 + step * along;
+  // The tiny number keeps 0 / 0 away where there is no total variation at all.
+  const float scale = radius / larger(larger(std::sqrt(a * a + b * b + c * c), radius), 1e-30f);
+  *q0 = a * scale;
+  *q1 = b * scale;
+  *q2 = c * scale;
+}
+
+// One row. `down` and `side` are the neighbouring rows along the two slower axes, null at the border (difference 0).
+void ascend_row(int64_t n, const float* __restrict u, const float* __restrict down, const float* __restrict side,
+                float* __restrict q0, float* __restrict q1, float* __restrict q2, float step, float radius) {
   if (!down) down = u;
   if (!side) side = u;
-  const auto ascend = [&](int64_t i, float along) {
-    const float a = q0[i] + step * (down[i] - u[i]);
-    const float b = q1[i] + step * (side[i] - u[i]);
-    const float c = q2[i] + step * along;
-    // The tiny number keeps 0 / 0 away where there is no total variation at all.
-    const float scale = radius / std::max(std::max(radius, std::sqrt(a * a + b * b + c * c)), 1e-30f);
-    q0[i] = a * scale;
-    q1[i] = b * scale;
-    q2[i] = c * scale;
-  };
-  for (int64_t i = 0; i + 1 < n; ++i) ascend(i, u[i + 1] - u[i]);
-  ascend(n - 1, 0.0f);
+  const int64_t last = n - 1;
+  for (int64_t i = 0; i < last; ++i)
+    ascend(q0 + i, q1 + i, q2 + i, down[i] - u[i], side[i] - u[i], u[i + 1] - u[i], step, radius);
+  ascend(q0 + last, q1 + last, q2 + last, down[last] - u[last], side[last] - u[last], 0.0f, step, radius);
 }
 
 struct Step {
@@ -35,13 +41,15 @@ struct Step {
 
 // One row of the primal variable: u - tau (slope + coupling * adjoint gradient of q), clamped to [lower, upper],
 // and its extrapolation 2 new - old. `above` and `before` are the neighbouring rows of q0 and q1, null at the border.
-void descend_row(int64_t n, const float* slope, const float* tau, const float* q0, const float* above, const float* q1,
-                 const float* before, const float* q2, const Step& step, float* u, float* extrapolated) {
-  const auto descend = [&](int64_t i, float last) {
-    const float inflow = (above ? above[i] : 0.0f) + (before ? before[i] : 0.0f) + last;
+template <bool kAbove, bool kBefore>
+void descend_row(int64_t n, const float* __restrict slope, const float* __restrict tau, const float* __restrict q0,
+                 const float* __restrict above, const float* __restrict q1, const float* __restrict before,
+                 const float* __restrict q2, Step step, float* __restrict u, float* __restrict extrapolated) {
+  const auto descend = [=](int64_t i, float last) {
+    const float inflow = (kAbove ? above[i] : 0.0f) + (kBefore ? before[i] : 0.0f) + last;
     const float divergence = inflow - q0[i] - q1[i] - q2[i];
     const float moved = u[i] - tau[i] * (slope[i] + step.coupling * divergence);
-    const float fresh = std::min(std::max(moved, step.lower), step.upper);
+    const float fresh = -larger(-larger(moved, step.lower), -step.upper);
     extrapolated[i] = 2 * fresh - u[i];
     u[i] = fresh;
   };
@@ -73,8 +81,10 @@ int64_t holosplat_tv_descend(const HoloGrid* grid, const float* slope, const flo
     holo::parallel(grid->depth, threads, [&](int64_t z) {
       for (int64_t y = 0; y < ny; ++y) {
         const int64_t at = z * plane + y * nx;
-        descend_row(nx, slope + at, tau + at, q + at, z > 0 ? q + at - plane : nullptr, q + all + at,
-                    y > 0 ? q + all + at - nx : nullptr, q + 2 * all + at, step, u + at, extrapolated + at);
+        const auto row = z > 0 ? (y > 0 ? descend_row<true, true> : descend_row<true, false>)
+                               : (y > 0 ? descend_row<false, true> : descend_row<false, false>);
+        row(nx, slope + at, tau + at, q + at, z > 0 ? q + at - plane : nullptr, q + all + at,
+            y > 0 ? q + all + at - nx : nullptr, q + 2 * all + at, step, u + at, extrapolated + at);
       }
     });
   });

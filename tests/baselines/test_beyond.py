@@ -68,8 +68,8 @@ def test_the_preconditioner_is_on_the_taller_volume():
     problem = VolumeProblem(whitened(cut(), BEYOND), ContinuousPrior(), 1.0)
     assert problem.grid.shape == (SHAPE[1], ROWS + 2 * BEYOND, SHAPE[1])
     u = 0.8 * blobs(Grid.of_views(problem.frames.field))
-    value, gradient = problem(u)
-    step = problem.preconditioner(u)(gradient)
+    value, slope = problem(u)
+    step = problem.preconditioner(u)(slope())
     assert problem((u - 0.1 * step).clamp_min(0))[0] < value
 
 

@@ -65,8 +65,8 @@ def test_the_preconditioner_is_on_the_wider_volume():
     problem = VolumeProblem(whitened(cut(), LEFT), ContinuousPrior(), 1.0)
     assert problem.grid.shape == (SHAPE[1], SHAPE[0], SHAPE[1])
     u = 0.8 * blobs(Grid.of_views(problem.frames.field))
-    value, gradient = problem(u)
-    step = problem.preconditioner(u)(gradient)
+    value, slope = problem(u)
+    step = problem.preconditioner(u)(slope())
     assert problem((u - 0.1 * step).clamp_min(0))[0] < value
 
 

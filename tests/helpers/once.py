@@ -119,12 +119,18 @@ def once(memory: Once) -> Iterator[None]:
         )
 
     def begin(
-        scan: Scan, material: DeltaBeta, options: HolographicTV, on_progress: Progress, light: Light | None = None
+        scan: Scan,
+        material: DeltaBeta,
+        options: HolographicTV,
+        on_progress: Progress,
+        light: Light | None = None,
+        lines: Tensor | None = None,
     ) -> tuple[Tensor, Grid]:
+        how = scan, material, options
         if light is not None:
-            return holographic_tv(scan, material, options, on_progress, light)
-        key = ("volume", *of(scan), material, options)
-        values, grid = memory.answer(key, lambda told: holographic_tv(scan, material, options, told), on_progress)
+            return holographic_tv(*how, on_progress, light, lines=lines)
+        key = ("volume", *of(scan), material, options, lines is None)
+        values, grid = memory.answer(key, lambda told: holographic_tv(*how, told, lines=lines), on_progress)
         return values.clone(), grid
 
     shared = {

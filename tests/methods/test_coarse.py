@@ -149,7 +149,7 @@ def test_of_the_volumes_before_and_after_rounds_the_better_is_cut(scan, order, m
         for mesh in (body(radius) for radius in order)
     )
 
-    def volumes(scan, material, how, on_progress, light, wanted):
+    def volumes(scan, material, how, on_progress, light, wanted, lines):
         assert wanted(before, grid)
         return after, grid
 

@@ -1,17 +1,24 @@
-"""Frames that judges predict: some views at a time, which changes nothing."""
+"""Frames that judges predict, some views at a time, which changes nothing; and what first volumes share."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 import torch
 
+from holosplat.baselines import HolographicTV
+from holosplat.baselines.holographic_tv import retrieved
+from holosplat.checks import NoMatterError
 from holosplat.geometry import Grid, Views
-from holosplat.matter import Matter
-from holosplat.methods.cross_validation import predicted_frames
+from holosplat.matter import DeltaBeta, MaterialPrior, Matter
+from holosplat.methods import cross_validation
+from holosplat.methods.cross_validation import FirstVolumes, Folds, predicted_frames
 from holosplat.model import measure
 from holosplat.optics import sampling
 from holosplat.representations import VoxelGrid
-from holosplat.scan import Exposures
+from holosplat.scan import Exposures, Scan
 
 SHAPE, PIXEL = (21, 33), 1e-6
 
@@ -44,3 +51,42 @@ def test_views_at_a_time_are_alike_and_few_enough(monkeypatch):
     rows, columns = (n + 2 * m for n, m in zip(SHAPE, sampling.padding(exposures[[0]], 1)))
     monkeypatch.setattr(sampling, "MOST_SAMPLES", 2 * rows * columns)
     assert [views.tolist() for views in sampling.alike(exposures, 1)][:2] == [[0, 2], [4]]
+
+
+def test_phase_retrieval_is_shared_between_folds_and_materials_of_one_ratio(monkeypatch):
+    """A phase is what is found: the thickness goes as 1/δ, and each view's is its own."""
+    exposures, body = scene()
+    exposures = exposures[[0, 2, 4]]
+    scan = Scan(measure(body, exposures, 2).numpy(), exposures, np.zeros(3, dtype=bool))
+    first = FirstVolumes(Folds.of(scan, binning=1), MaterialPrior.of_ratio(2000.0), lambda stage, fraction: None)
+    asked, how = list[DeltaBeta](), HolographicTV(retrieval=5)
+
+    def counted(scan, material, options, on_progress):
+        asked.append(material)
+        return retrieved(scan, material, options, on_progress)
+
+    monkeypatch.setattr(cross_validation, "retrieved", counted)
+    one, two = DeltaBeta(7e-7, 7e-7 / 2000), DeltaBeta(3e-7, 3e-7 / 2000)
+    part = replace(first, folds=Folds.of(first.folds.split(1)[0], binning=1), part_of=(first, 1))
+    lines = part.lines(part.folds.scan, two, how)
+    alone = retrieved(first.folds.split(1)[0], two, how, lambda stage, fraction: None)
+    assert lines is not None
+    assert float((lines - alone).norm()) < 0.02 * float(alone.norm())
+    assert torch.allclose(first.thickness(1, one, how) * one.delta, lines * two.delta, rtol=1e-5)
+    assert part.lines(scan, two, how) is None
+    assert asked == [two]
+
+
+def test_that_there_is_no_matter_is_found_once():
+    exposures, _ = scene()
+    scan = Scan(np.ones((5, *SHAPE), dtype=np.float32), exposures, np.zeros(5, dtype=bool))
+    first, made = FirstVolumes(Folds.of(scan), MaterialPrior.of_ratio(2000.0), lambda stage, fraction: None), []
+
+    def make():
+        made.append(None)
+        raise NoMatterError
+
+    for _ in range(2):
+        with pytest.raises(NoMatterError):
+            first.once("material", 0, make)
+    assert len(made) == 1

@@ -162,7 +162,7 @@ def test_the_occupancy_is_bounded_only_where_one_means_something(scan, prior):
 def test_so_is_the_occupancy_of_the_start(scan, monkeypatch, prior, upper):
     begun: list[HolographicTV] = []
 
-    def begin(scan, material, options, on_progress, light):
+    def begin(scan, material, options, on_progress, light, lines):
         begun.append(options)
         raise KeyboardInterrupt
 

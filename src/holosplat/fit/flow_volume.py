@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate
 
 from ..representations.flow import Fading, Flow, fading_factor
-from .smooth_volume import ContinuousPrior, VolumeProblem
+from .smooth_volume import ContinuousPrior, Slope, VolumeProblem
 from .whitened import WhitenedFrames
 
 SPARSE = 6.0
@@ -72,8 +72,8 @@ class FlowProblem:
         """The volume [Z, Y, X] of the time numbered k."""
         return _carried(u, self._sources[k], self._fading[k])
 
-    def __call__(self, u: Tensor) -> tuple[float, Tensor]:
-        """The objective and its gradient [Z, Y, X]."""
+    def __call__(self, u: Tensor) -> tuple[float, Slope]:
+        """The objective and its gradient [Z, Y, X], computed at once: graphs of all times would take memory."""
         value, gradient = 0.0, torch.zeros_like(u)
         for k, still in enumerate(self._still):
             with torch.enable_grad():
@@ -82,7 +82,8 @@ class FlowProblem:
                 misfit = still.frames(still.lines(now.detach()))
                 (pulled,) = torch.autograd.grad(now, leaf, still.backprojection(misfit.gradient))
             value, gradient = value + misfit.value, gradient + pulled
-        return value + self._still[0].penalty(u, gradient), gradient
+        prior, pull = self._still[0].penalty(u)
+        return value + prior, lambda: pull(gradient)
 
     def preconditioner(self, u: Tensor) -> Callable[[Tensor], Tensor]:
         """About the inverse of the second derivative, as if nothing moved."""

@@ -32,6 +32,9 @@ MATTER = 0.05
 ALIKE = 1e-6
 """Difference of β, as a share, below which two materials have one ratio."""
 
+Slope = Callable[[], Tensor]
+"""Computes a gradient, which steps that are refused do not need."""
+
 
 @checked_dataclass
 class ContinuousPrior:
@@ -144,28 +147,34 @@ class VolumeProblem:
         """The adjoint of `lines`."""
         return self._projector.volume_out(self._projector.backproject(self._projector.lines_in(lines.contiguous())))
 
-    def __call__(self, u: Tensor) -> tuple[float, Tensor]:
+    def __call__(self, u: Tensor) -> tuple[float, Slope]:
         """The objective and its gradient [Z, Y, X]."""
-        misfit = self.frames(self.lines(u))
-        gradient = self.backprojection(misfit.gradient)
-        value = misfit.value + self.penalty(u, gradient)
-        return value, gradient if self.support is None else gradient * self.support
+        misfit, (prior, pull) = self.frames(self.lines(u)), self.penalty(u)
 
-    def penalty(self, u: Tensor, gradient: Tensor) -> float:
-        """The prior of u; its gradient is added to `gradient`."""
+        def slope() -> Tensor:
+            gradient = pull(self.backprojection(misfit.gradient))
+            return gradient if self.support is None else gradient * self.support
+
+        return misfit.value + prior, slope
+
+    def penalty(self, u: Tensor) -> tuple[float, Callable[[Tensor], Tensor]]:
+        """The prior of u, and what adds its gradient to that of the misfit."""
         prior, level = self.prior, self.level
         b, epsilon, v = prior.slope * level, prior.rounding * level, prior.value * level
         size = _slopes(u, epsilon)
         value = prior.slopes * float(((size - epsilon) / b).log1p().double().sum())
         away, slope = prior.distance(u, epsilon)
         value += prior.values * float((away / v).log1p().double().sum())
-        pull = prior.slopes / ((b - epsilon + size) * size)
-        for axis in range(3):
-            flow = pull.narrow(axis, 0, u.shape[axis] - 1) * u.diff(dim=axis)
-            gradient.narrow(axis, 1, u.shape[axis] - 1).add_(flow)
-            gradient.narrow(axis, 0, u.shape[axis] - 1).sub_(flow)
-        gradient.add_(slope.mul_(prior.values / (v + away)))
-        return value
+
+        def pulled(gradient: Tensor) -> Tensor:
+            pull = prior.slopes / ((b - epsilon + size) * size)
+            for axis in range(3):
+                flow = pull.narrow(axis, 0, u.shape[axis] - 1) * u.diff(dim=axis)
+                gradient.narrow(axis, 1, u.shape[axis] - 1).add_(flow)
+                gradient.narrow(axis, 0, u.shape[axis] - 1).sub_(flow)
+            return gradient.add_(slope * (prior.values / (v + away)))
+
+        return value, pulled
 
     def preconditioner(self, u: Tensor, times: int = 1) -> Callable[[Tensor], Tensor]:
         """About the inverse of the second derivative at u: by spatial frequency, of the data and of mean slopes.
@@ -210,7 +219,7 @@ class Penalised(Protocol):
 
     lower: float
 
-    def __call__(self, u: Tensor) -> tuple[float, Tensor]:
+    def __call__(self, u: Tensor) -> tuple[float, Slope]:
         """The objective and its gradient [Z, Y, X]."""
         ...
 
@@ -233,7 +242,8 @@ class Descent:
 
     def __init__(self, problem: Penalised, start: Tensor, kept: bool = False) -> None:
         self.problem, self.u, self.kept = problem, start.clamp_min(problem.lower), kept
-        self.value, self._gradient = problem(self.u)
+        self.value, slope = problem(self.u)
+        self._gradient = slope()
         self.done, self.ended = 0, False
         self._pairs = list[tuple[Tensor, Tensor]]()
         self._conditioned(self.u)
@@ -272,7 +282,7 @@ class Descent:
                 continue
             found, slope = self.problem(moved)
             if found <= self.value + SUFFICIENT * min(0.0, product(gradient, moved - u)):
-                return moved, found, slope
+                return moved, found, slope()
         return None
 
     def state_dict(self) -> dict[str, Any]:

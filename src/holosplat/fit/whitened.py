@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -68,10 +69,17 @@ LITTLE = 0.02
 
 @dataclass(frozen=True)
 class Misfit:
-    """Value and gradient of a whitened misfit: value: ½ χ²; gradient [V, H, W]: by the line integrals in pixels."""
+    """A whitened misfit. value: ½ χ²; of: a number whose gradient by the line integrals `at` is that of the misfit."""
 
     value: float
-    gradient: Tensor
+    of: Tensor
+    at: Tensor
+
+    @cached_property
+    def gradient(self) -> Tensor:
+        """By the line integrals in pixels [V, H, W], computed when it is wanted, for it costs as much as the value."""
+        (gradient,) = torch.autograd.grad(self.of, self.at)
+        return gradient
 
 
 class WhitenedFrames:
@@ -178,12 +186,12 @@ class WhitenedFrames:
         return torch.fft.irfft2(spectrum, s=(h * s, w * s))
 
     def __call__(self, lines: Tensor) -> Misfit:
-        """Misfit of line integrals [V, H, W] and its gradient."""
+        """Misfit of line integrals [V, H, W]."""
         at = lines.detach().requires_grad_()
         difference = self.known(self.amplitudes(at) - self._amplitudes)
         weighted = self.whitened(difference.detach())
-        (gradient,) = torch.autograd.grad((difference * weighted).sum(), at)
-        return Misfit(0.5 * float((difference.detach().double() * weighted).sum()), gradient)
+        value = 0.5 * float((difference.detach().double() * weighted).sum())
+        return Misfit(value, (difference * weighted).sum(), at)
 
     def whitened(self, images: Tensor) -> Tensor:
         """Images [V, H, W] over the covariance of the amplitudes' errors: their spectra over P, and with doubtful light

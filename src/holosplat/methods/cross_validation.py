@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 from typing import TypeVar
 
 import numpy as np
@@ -20,7 +20,7 @@ from ..baselines.algebraic import Algebraic, sirt
 from ..baselines.beyond import margins_of
 from ..baselines.holographic_tv import Correction, retrieved
 from ..baselines.material import DEFAULT, RATIOS, USUAL_RATIO, MaterialEstimate, estimate_delta
-from ..checks import InputError
+from ..checks import InputError, NoMatterError
 from ..fit.whitened import WhitenedFrames
 from ..frames import evenly
 from ..geometry import Grid
@@ -201,9 +201,13 @@ class FirstVolumes:
     )
     taken: tuple[str, ...] = ()
     """What was decided of light and noise."""
+    part_of: tuple[FirstVolumes, int] | None = None
+    """The volumes, and their fold, whose fitted frames these are, as they were measured."""
     _ratio: float | None = None
     _material: DeltaBeta | None = None
     _made: dict[tuple[object, int], object] = field(default_factory=dict)
+    _thickness: dict[object, tuple[Tensor, float]] = field(default_factory=dict)
+    """What phase retrieval has found in all coarse frames as they were measured, for which δ."""
 
     @property
     def material(self) -> DeltaBeta:
@@ -212,7 +216,8 @@ class FirstVolumes:
             prior = self.prior
             if self._ratio or not prior.fixes_ratio:
                 prior = prior.with_ratio(self._ratio or self.ratio[0])
-            self._material = assumed_material(self.folds.scan, prior, self.on_progress, self.options.backend)
+            how = self.folds.scan, prior, self.on_progress, self.options.backend
+            self._material = self.once("material", 0, lambda: assumed_material(*how))
         return self._material
 
     @property
@@ -222,7 +227,8 @@ class FirstVolumes:
 
     def at_ratio(self, ratio: float) -> FirstVolumes:
         """Volumes of the same folds, of one material of δ/β `ratio`."""
-        return replace(self, _ratio=ratio, _material=None, _made={})
+        made = partial(replace, self, _ratio=ratio, _material=None, _made={})
+        return self.once(("at ratio", self.prior, ratio), 0, made)
 
     def as_measured(self, fold: int) -> Score:
         """The score of the volume of a fold in even light and white noise, on the unseen frames."""
@@ -235,18 +241,23 @@ class FirstVolumes:
         return replace(self.options, two_sided=self.prior.two_sided)
 
     def once(self, key: object, fold: int, make: Callable[[], T]) -> T:
-        """What `make` gives, made once for a key and a fold."""
+        """What `make` gives, or that there is no such matter, made once for a key and a fold."""
         if (key, fold) not in self._made:
-            self._made[key, fold] = make()
-        return self._made[key, fold]  # type: ignore[return-value]
+            try:
+                self._made[key, fold] = make()
+            except NoMatterError as error:
+                self._made[key, fold] = error
+        found = self._made[key, fold]
+        if isinstance(found, NoMatterError):
+            raise found
+        return found  # type: ignore[return-value]
 
     def volume(self, fold: int, light: Light) -> VoxelGrid:
         """The volume of the fitted frames of a fold, which were measured in `light`."""
         seen, _ = self.folds.split(fold)
         even, lines = replace(seen, frames=light.evened(torch.from_numpy(seen.frames)).numpy()), None
-        plain = light.background is None and light.still is None and not light.noise.has_grain
-        if plain and self.folds.by == BY_VIEWS:
-            lines = self.once("thickness", 0, self._thickness)[self.folds.kept(fold)]
+        if is_plain(light) and self.folds.by == BY_VIEWS:
+            lines = self.thickness(fold, self.material, self._how)
         values, grid = holographic_tv(even, self.material, self._how, self.on_progress, light, lines=lines)
         if self.prior.spherical:
             beyond = margins_of(grid, seen.views)
@@ -254,9 +265,21 @@ class FirstVolumes:
             values = likeliest_sphere(frames, values, self.prior.lower)
         return VoxelGrid(values[None], grid, Matter.one(*self.material)).on(resolve(self.options.backend))
 
-    def _thickness(self) -> Tensor:
-        """What phase retrieval finds in all coarse frames as they were measured, each by itself: folds share it."""
-        return retrieved(self.folds.scan, self.material, self._how, self.on_progress)
+    def thickness(self, fold: int, material: DeltaBeta, how: HolographicTV) -> Tensor:
+        """What phase retrieval finds in the fitted frames of a fold as they were measured [V, H, W] [m]: each frame by
+        itself, so that folds share it, and materials of one δ/β, for phases are what is found."""
+        key = (f"{material.ratio:.9g}", material.delta > 0, how.retrieval, how.two_sided, how.backend)
+        if key not in self._thickness:
+            self._thickness[key] = retrieved(self.folds.scan, material, how, self.on_progress), material.delta
+        lines, delta = self._thickness[key]
+        return lines[self.folds.kept(fold)] * (delta / material.delta)
+
+    def lines(self, scan: Scan, material: DeltaBeta, how: HolographicTV) -> Tensor | None:
+        """The same of the frames of `scan`, where these are a part of other ones that share it; else None."""
+        if self.part_of is None or scan is not self.folds.scan:
+            return None
+        whole, fold = self.part_of
+        return whole.thickness(fold, material, how)
 
 
 def unseen_ratio(first: FirstVolumes) -> tuple[float, Decision]:
@@ -309,6 +332,11 @@ def assumed_material(
         ratio, _ = FirstVolumes(Folds.of(scan), prior, on_progress).ratio
     delta = estimate_delta(scan, ratio, on_progress, backend, options, prior.delta_sign, prior.two_sided)
     return DeltaBeta(delta, delta / ratio)
+
+
+def is_plain(light: Light) -> bool:
+    """Whether light is even, and its noise white."""
+    return light.background is None and light.still is None and not light.noise.has_grain
 
 
 def plain_light(frames: Tensor, options: LightOptions) -> Light:

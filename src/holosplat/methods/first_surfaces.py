@@ -105,7 +105,8 @@ def _of_volume(task: Task, options: GaussianOptions, surfaces: SurfaceOptions) -
         return tried[-1][0] > options.coarse.missing
 
     how = replace(options.volume, refine=1)
-    last = holographic_tv(task.scan, matter, how, task.on_progress, task.unlike_null, poor)
+    known = {"wanted": poor, "lines": task.lines(task.scan, matter, how)}
+    last = holographic_tv(task.scan, matter, how, task.on_progress, task.unlike_null, **known)
     if not tried or tried[0][0] > options.coarse.missing:
         poor(*last)
     return min(tried, key=lambda one: one[0])[1]

@@ -23,7 +23,7 @@ from ..inference import Decision, Score, select
 from ..matter import MatterKind
 from ..representations import Stored, VoxelGrid
 from ..tables import with_entries
-from .cross_validation import BY_FISSION, EFFORT, FirstVolumes, predictions, without_matter
+from .cross_validation import BY_FISSION, EFFORT, FirstVolumes, is_plain, predictions, without_matter
 from .method import Method, Task, first_of_task, solve_stages
 from .trials import WITHOUT, Hypothesis, Trial, Trials, accepted, hypothesis_of, name_of
 from .uncertain import Determined, likeliest_ratio
@@ -151,7 +151,9 @@ class TrialFits:
             ratio = ratio_of_one(task, self._first).value if known else self._first.material.ratio
             prior = prior.with_ratio(ratio)
         fitted = replace(task, scan=seen, prior=prior, lit=trial.light, matter=kind, first=None)
-        fitted = replace(fitted, first=first_of_task(fitted).at_ratio(self._first.material.ratio))
+        first = first_of_task(fitted).at_ratio(self._first.material.ratio)
+        shared = is_plain(trial.light) and self._first.folds.by != BY_FISSION
+        fitted = replace(fitted, first=replace(first, part_of=(self._first, fold) if shared else None))
         if fitted.bounded and not prior.materials and "continuous" in self._methods:
             volume = self._fit(hypothesis, "continuous", fold)
             fitted = replace(fitted, likeliest=volume if isinstance(volume, VoxelGrid) else None)

@@ -8,15 +8,17 @@ from typing import Any, ClassVar, NamedTuple, Protocol, Self, TypeVar, runtime_c
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from ..backends import Backend
+from ..baselines import HolographicTV
 from ..baselines.material import LIKELY_RATIOS
 from ..checks import require
 from ..fit.pose_refinement import PoseRefinement, with_alignment
 from ..fit.run import Run, Running
 from ..inference import Decision
 from ..learning.start import GuessedMatter
-from ..matter import MaterialPrior, MatterKind
+from ..matter import DeltaBeta, MaterialPrior, MatterKind
 from ..model import Model
 from ..optics.background import Light, LightOptions
 from ..optics.noise import NoiseModel
@@ -107,6 +109,10 @@ class Task:
         """The same task with the frames number `chosen` alone."""
         lit = self.lit and self.lit.part(torch.from_numpy(chosen))
         return replace(self, scan=self.scan[chosen], lit=lit, first=None)
+
+    def lines(self, scan: Scan, material: DeltaBeta, how: HolographicTV) -> Tensor | None:
+        """What phase retrieval has found in the frames of `scan` before (`FirstVolumes.lines`), if it has."""
+        return None if self.first is None else self.first.lines(scan, material, how)
 
     def moved(self, fitted: Model) -> Task:
         """The same task with the frames where a fit has found them."""

@@ -76,7 +76,8 @@ def _from_phase_retrieval(task: Task, options: GaussianOptions) -> GaussianCloud
     how = replace(options.volume, upper=upper, two_sided=task.prior.two_sided)
 
     def retrieve(frames: Scan) -> tuple[Tensor, Grid]:
-        return holographic_tv(frames, material, how, task.on_progress, task.unlike_null)
+        lines = task.lines(frames, material, how)
+        return holographic_tv(frames, material, how, task.on_progress, task.unlike_null, lines=lines)
 
     volume, grid = retrieve(scan)
     if task.prior.two_sided and not task.prior.materials[1:]:

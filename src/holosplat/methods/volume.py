@@ -116,7 +116,8 @@ class SmoothStage:
         material = assumed_material(scan, one_material(task), task.on_progress, backend, options.estimate)
         beyond = options.volume.beyond and not task.prior.spherical  # which lies in the frames
         how = replace(options.volume, upper=0.0, two_sided=task.prior.two_sided, beyond=beyond)
-        first, grid = holographic_tv(scan, material, how, task.on_progress, light)
+        lines = task.lines(scan, material, how)
+        first, grid = holographic_tv(scan, material, how, task.on_progress, light, lines=lines)
         field = scan.views.padded(margins_of(grid, scan.views))
         return VoxelGrid(first[None], grid, Matter.one(*material)).resampled(Grid.of_views(field))
 
