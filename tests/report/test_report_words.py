@@ -172,3 +172,13 @@ def test_the_size_of_voxels_is_no_term_of_the_loss():
     figure = history_figure({"step": steps, "loss": 1 / steps, "voxel_px": np.repeat([2.0, 1.0], 4)})
     assert figure is not None
     assert len(figure.axes[0].lines) == 1
+
+
+def test_a_loss_that_is_a_logarithm_is_drawn_whole():
+    """It is negative, which an axis by powers of ten does not show."""
+    steps = np.arange(1.0, 9.0)
+    figure = history_figure({"step": steps, "loss": -np.sqrt(steps), "frames": -steps, "rounded": 1 / steps})
+    assert figure is not None
+    (line,) = figure.axes[0].lines
+    np.testing.assert_array_equal(line.get_ydata(), -np.sqrt(steps))
+    assert (figure.axes[0].get_yscale(), figure.axes[0].get_ylabel()) == ("linear", "log of loss")

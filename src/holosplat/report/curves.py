@@ -117,8 +117,9 @@ def history_figure(history: Mapping[str, np.ndarray]) -> Figure | None:
     def known(*names: str) -> list[str]:
         return [name for name in names if name in columns and _has(columns[name])]
 
+    plain = np.all(columns.get("loss", np.ones(1)) > 0)  # else it is a logarithm itself, as of surfaces
     panels = [
-        ("Loss", known("loss") + terms, "loss", "log"),
+        ("Loss", known("loss") + terms, "loss", "log") if plain else ("Loss", known("loss"), "log of loss", "linear"),
         ("Validation scores", scores, "score", "linear"),
         ("Validation PSNR", known("val_psnr"), "PSNR (dB)", "linear"),
         ("Primitives", known("count"), "number of primitives", "linear"),
