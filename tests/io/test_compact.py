@@ -130,7 +130,7 @@ def test_files_that_say_nothing_sensible_are_refused(name, value, tmp_path):
         read_object(tmp_path / "c.h5")
     with h5py.File(tmp_path / "c.h5", "r+") as file:
         del file["centres"].attrs[name]
-    with pytest.raises(InputError, match=r"centres must say its step, type and differences"):
+    with pytest.raises(InputError, match=r"centres must be a tensor with its step, type and differences"):
         read_object(tmp_path / "c.h5")
 
 

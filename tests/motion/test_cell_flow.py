@@ -143,7 +143,7 @@ def test_a_channel_may_lie_along_any_axis():
         assert frame.outside(torch.from_numpy(frame.inward(points))).numpy() == pytest.approx(points)
         middle = frame.inward(np.array([1.0, 2.0, 3.0]))
         assert middle[1:] == pytest.approx([1.5e-6, 1e-6])
-    with pytest.raises(InputError, match="channel"):
+    with pytest.raises(InputError, match="across must be a positive number"):
         ChannelFrame((0.0, 1e-6))
 
 

@@ -210,7 +210,7 @@ def test_times_of_frames():
         with pytest.raises(InputError, match=words):
             timing.times(length)
     for bad, words in (
-        (lambda: Timing(0), "frame rate"),
+        (lambda: Timing(0), "frame_rate"),
         (lambda: Timing(1, 0), "frames must be at least 1"),
         (lambda: Timing(1, start=-1.0), "start"),
         (lambda: Shutter(1e-6), "both"),

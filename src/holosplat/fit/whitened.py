@@ -77,7 +77,7 @@ class Misfit:
 
     @cached_property
     def gradient(self) -> Tensor:
-        """By the line integrals in pixels [V, H, W], computed when it is wanted, for it costs as much as the value."""
+        """By the line integrals in pixels [V, H, W]; it costs as much as the value, and is computed on demand."""
         (gradient,) = torch.autograd.grad(self.of, self.at)
         return gradient
 
