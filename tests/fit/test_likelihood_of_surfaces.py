@@ -123,15 +123,17 @@ def noisy() -> tuple[Scan, Model, FrameTerm]:
     return scan, model, FrameTerm(scan, instrument, objective, Matter.one(DELTA, 0.0))
 
 
-def test_the_likelihood_is_that_of_normal_noise_of_the_most_likely_level(noisy):
-    """Of residuals that are far below c: N/2 log of their mean square, up to a constant."""
+@pytest.mark.parametrize("alike", [False, True])
+def test_the_likelihood_is_that_of_normal_noise_of_the_most_likely_levels(noisy, alike):
+    """Of residuals that are far below c: N/2 log of their mean square in each view, or in all, up to a constant."""
     scan, model, frames = noisy
-    term = ProfileLikelihood(frames, int(scan.measured.isfinite().sum()))
+    term = ProfileLikelihood(frames, int(scan.measured.isfinite().sum()), alike)
     assert term.nat == 2 / (3 * 35 * 42 - 1)
     for index in (None, torch.tensor([2, 0])):
         part, shown = term(model, replace(WHOLE, index=index))
         assert (part.weight, shown.weight, shown.name) == (1.0, None, "rounded")
         left = scan.left(model.frames(None).detach()).double()
-        square = float((left if index is None else left[index]).square().mean())
-        wanted = np.log(square / (2 * frames.resolved["rounding"] * frames.span**2))
+        squares = (left if index is None else left[index]).square().mean(dim=(1, 2))
+        level = squares.mean() if alike else squares
+        wanted = float((level / (2 * frames.resolved["rounding"] * frames.span**2)).log().mean())
         assert float(part.value.detach()) == pytest.approx(wanted, abs=0.01)

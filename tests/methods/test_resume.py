@@ -52,7 +52,7 @@ def surface(seed: int) -> Fit:
     """Without the prior, whose scale is that of the start, which a checkpoint of a run holds."""
     ball = surfaces(bumpy(2, 5.0 + seed, depth=0.0))
     schedule = Schedule(steps=12, views_per_step=2, **VALIDATED)
-    return surface_fit(scan(), ball, SurfaceFit(stiffness=5.0, curvature=0.0, schedule=schedule), seed)
+    return surface_fit(scan(), ball, SurfaceFit(worth=0.0, stiffness=5.0, curvature=0.0, schedule=schedule), seed)
 
 
 @cache

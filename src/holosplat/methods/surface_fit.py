@@ -190,7 +190,7 @@ def surface_fit(
         schedule = replace(schedule, views_per_step=0, views_at_once=schedule.views_per_step)
     start = start.on(backend)
     base = ground(scan, start, start.matter, options.objective, schedule, backend, finer=finer, light=light)
-    frames = ProfileLikelihood(base.frames, int(base.train.measured.isfinite().sum()))
+    frames = ProfileLikelihood(base.frames, int(base.train.measured.isfinite().sum()), alike=bool(freedom))
     prior = [CurvatureVariation(options.curvature * frames.nat, start)] if options.curvature > 0 else []
     solve = (_membrane_on_gpu if backend == "cuda" else _membrane)(start, options.stiffness)
 

@@ -211,13 +211,17 @@ class FrameTerm:
 
     def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
         """The loss of the frames, and the comparisons that it is made of."""
+        per_view, shown = self.of_views(model, batch)
+        if self._detach_worst and len(per_view) > 1:
+            per_view = torch.where(per_view > per_view.detach().median(), per_view.detach(), per_view)
+        return [LossPart("frames", 1.0, per_view.mean()), *shown]
+
+    def of_views(self, model: Model, batch: Batch) -> tuple[Tensor, list[LossPart]]:
+        """The loss [V] of each view, and the means of the comparisons that it is made of."""
         parts = self.compared(model.frames(batch.index), batch)
         per_view = sum(weight * value for weight, value in parts.values())
         assert isinstance(per_view, Tensor)
-        if self._detach_worst and len(per_view) > 1:
-            per_view = torch.where(per_view > per_view.detach().median(), per_view.detach(), per_view)
-        shown = [LossPart(name, None, value.detach().mean()) for name, (_, value) in parts.items()]
-        return [LossPart("frames", 1.0, per_view.mean()), *shown]
+        return per_view, [LossPart(name, None, value.detach().mean()) for name, (_, value) in parts.items()]
 
     def compared(self, predicted: Tensor, batch: Batch) -> dict[str, Weighted]:
         """Weight and value [V] of every comparison in use."""
@@ -262,25 +266,27 @@ class FrameTerm:
 
 
 class ProfileLikelihood:
-    """Minus the log-likelihood of frames whose noise level is not known, in units of `nat`: the logarithm of the loss
-    of `FrameTerm`.
+    """Minus the log-likelihood of frames whose noise levels are not known, in units of `nat`: the mean over views of
+    the logarithm of the loss that `FrameTerm` gives each.
 
     With the variance of N pixels profiled out, the logarithm of the likelihood of residuals r is -N/2 log Σ r² (Seber &
     Wild 2003, "Nonlinear Regression", section 2.2.1). So priors need no estimate of the noise, and what the model
-    cannot explain counts as noise. All views of a batch have one level: one whose pose is wrong is no noise.
+    cannot explain counts as noise.
     """
 
-    def __init__(self, frames: FrameTerm, pixels: int) -> None:
-        """pixels: of all frames, those without a value left out."""
-        self._frames, self.names, self.resolved = frames, frames.names, frames.resolved
+    def __init__(self, frames: FrameTerm, pixels: int, alike: bool = False) -> None:
+        """pixels: of all frames, those without a value left out; alike: all views of a batch have one level, as where
+        their poses are not known: what a wrong pose leaves is no noise."""
+        self._frames, self.names, self.resolved, self._alike = frames, frames.names, frames.resolved, alike
         self.nat = 2 / pixels
         """A unit of minus the logarithm of a probability, in units of this term."""
 
     def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
         """The one part, and the comparisons that it is made of."""
-        first, *shown = self._frames(model, batch)
-        least = torch.finfo(first.value.dtype).tiny
-        return [LossPart("frames", 1.0, first.value.clamp_min(least).double().log()), *shown]
+        per_view, shown = self._frames.of_views(model, batch)
+        level = per_view.mean() if self._alike else per_view
+        least = torch.finfo(level.dtype).tiny
+        return [LossPart("frames", 1.0, level.clamp_min(least).double().log().mean()), *shown]
 
 
 class NarrowingBlur:
