@@ -84,6 +84,14 @@ def test_a_shape_costs_as_much_at_any_size_and_place():
     assert float(energy(both)) == pytest.approx(alone[0] + alone[2], rel=1e-9)
 
 
+def test_uneven_triangles_of_the_same_shape_cost_more():
+    """Vertices that are moved along the tube, where its curvature stays."""
+    ring, off = tube(24), np.random.default_rng(3).normal(size=(len(tube(24).vertices), 1))
+    along = torch.linalg.cross(torch.tensor([[0.0, 0.0, 1.0]]).double().expand_as(ring.vertices), ring.vertices)
+    moved = ring.vertices + 0.2 * torch.from_numpy(off) * along / along.norm(dim=1, keepdim=True)
+    assert float(energy(ring, moved)) > 100 * float(energy(ring))
+
+
 def test_vertices_of_no_triangle_cost_nothing():
     bumps = surfaces(bumpy(3, 9.0))
     points = torch.cat([bumps.vertices, torch.tensor([[50.0, 0.0, 0.0]])])

@@ -89,10 +89,6 @@ class CoarseToFine:
             factor *= 2
         return factor
 
-    def nearby(self, fit: SurfaceFit) -> SurfaceFit:
-        """The fit of surfaces near to those of the frames' own pixels: fewer steps."""
-        return in_steps(fit, self.last_steps)
-
     def of_views(self, count: int) -> CoarseToFine:
         """The same with steps for so many frames: as many looks at them in all as for `views`."""
         more = max(1.0, self.views / max(1, count))
@@ -140,7 +136,8 @@ def coarse_surfaces(
         factor //= 2
     found = on_pixels(found, task.scan.views.finest, how.last_edge)
     if unexplained(found, task.scan, surfaces) > most:
-        found = _run(replace(task, freedom=None), found, how.nearby(surfaces.fit))  # edges may be off by more
+        near = in_steps(surfaces.fit, how.last_steps)  # edges may be off by more
+        found = _run(replace(task, freedom=None), found, near)
         if unexplained(found, task.scan, surfaces) > most:
             return None, found
     return found, None
@@ -149,7 +146,7 @@ def coarse_surfaces(
 def last_steps(task: Task, found: SurfaceMesh, surfaces: SurfaceOptions, how: CoarseToFine) -> SurfaceMesh:
     """The surfaces that `coarse_surfaces` has `found`, fitted to the frames of `task` themselves."""
     how = how.of_views(len(task.scan.train()))
-    return _run(replace(task, freedom=None), found, how.nearby(surfaces.fit))
+    return _run(replace(task, freedom=None), found, in_steps(surfaces.fit, how.last_steps))
 
 
 def binned(task: Task, factor: int) -> Task:

@@ -15,7 +15,7 @@ from ..matter import MaterialPrior
 from ..progress import Progress
 from ..representations import GaussianCloud, Stored, SurfaceMesh
 from ..scan import Scan
-from .coarse import CoarseToFine, Way, begun_surfaces, coarse_surfaces, missing_matter, on_pixels, settled
+from .coarse import CoarseToFine, Way, begun_surfaces, coarse_surfaces, in_steps, missing_matter, on_pixels, settled
 from .cross_validation import BY_FISSION, MANY, Folds
 from .first_surfaces import first_surfaces, is_noisy, surfaces_of_volume, with_missing_bodies
 from .gaussians import Gaussians, GaussianStage
@@ -225,7 +225,7 @@ class SurfaceStage:
         """The fit of the surfaces to the training frames."""
         assert isinstance(start, SurfaceMesh)
         coarse = self.coarse.of_views(len(task.scan.train()))
-        options = coarse.nearby(self.options.fit) if task.near else self.options.fit
+        options = in_steps(self.options.fit, coarse.last_steps) if task.near else self.options.fit
         freedom = task.freedom and replace(task.freedom, edges=task.prior.kind == "known")
         return surface_fit(task.scan, start, options, task.seed, task.uneven, freedom)
 
