@@ -83,17 +83,34 @@ def test_the_null_wins_ties_and_the_simpler_candidate_too():
     assert found.compared[2].gain == pytest.approx(math.log(0.9 / 0.895), rel=1e-6)  # beside the second
 
 
-def test_what_wins_in_one_fold_must_win_over_all():
-    asked = []
+def test_what_wins_in_one_fold_by_frames_that_differ_must_win_over_all():
+    asked, uneven = [], torch.tensor([0.5, 0.85])[:, None, None]  # gains of .69 and .16
 
     def score(name, fold):
         asked.append((name, fold))
-        return residuals({"null": (1.0, 1.0, 1.0), "other": (0.5, 2.5, 1.0)})(name, fold)
+        factor = 1.0 if name == "null" else (uneven, 2.5, 1.0)[fold]
+        return Score.of(factor * noise((2, 64, 64), fold))
 
     found = select("name", ["null", "other"], score, 3, by="views set aside")
     assert found.choice == "null"
     assert ("other", 1) in asked
     assert ("other", 2) not in asked  # it had lost by then
+
+
+@pytest.mark.parametrize(("folds", "factors"), [(3, (0.6, 0.75)), (2, (0.6, 0.75)), (3, (0.6, 0.85))])
+def test_a_candidate_wins_early_by_more_errors_than_in_the_end(folds, factors):
+    """Two frames of gains a and b have the mean (a + b) / 2 and the error |a - b| / 2; after 1 of K folds a candidate
+    needs 2 √K errors."""
+    asked, uneven = set(), torch.tensor(factors)[:, None, None]
+
+    def score(name, fold):
+        asked.add(fold)
+        return Score.of((1.0 if name == "null" else uneven) * noise((2, 96, 64), fold))
+
+    assert select("name", ["null", "other"], score, folds, by="views set aside").choice == "other"
+    a, b = (-math.log(each) for each in factors)
+    early = (a + b) / 2 > 2 * math.sqrt(folds) * abs(a - b) / 2
+    assert early == (asked == {0})
 
 
 def test_what_one_fold_leaves_open_all_of_them_decide():

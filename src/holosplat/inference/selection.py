@@ -68,8 +68,12 @@ class Score:
         """The score of several sets of frames, with one block a frame; of one set the same."""
         if len(scores) == 1:
             return scores[0]
-        whole = [one.powers.reshape(one.frames, -1, one.powers.shape[1]).mean(axis=1) for one in scores]
-        return cls(np.concatenate(whole), sum(one.frames for one in scores))
+        return cls(np.concatenate([one.by_frames.powers for one in scores]), sum(one.frames for one in scores))
+
+    @property
+    def by_frames(self) -> Score:
+        """The same with one block a frame."""
+        return Score(self.powers.reshape(self.frames, -1, self.powers.shape[1]).mean(axis=1), self.frames)
 
     def gain_over(self, other: Score) -> tuple[float, float]:
         """How much smaller the residual is than that of `other`, and the standard error of this.
@@ -191,21 +195,23 @@ def select(
     """The candidate that predicts unseen frames best, by the policy of `Compared.wins`.
 
     candidates: the null first, then from simple to complex; score: of a candidate on the unseen frames of a fold, kept
-    by the caller; folds: how many there are. Folds are looked at one after another, as long as the candidate may win by
-    those before; it is taken only if it wins over all of them, where the frames, and not their blocks, give the
-    standard error: frames differ by more than their parts do. by: how unseen frames came about; beside: other names
-    that a candidate must win against, too. surely, least: whether a gain must be sure, and the practical size that it
-    must have. Where another score has told that it is sure, its size is enough; where another has told its size
-    (`least` is 0), it need only be sure.
+    by the caller; folds: how many there are. Folds are looked at one after another, as long as those before leave the
+    candidate open: it may win by them, and has not won early. The frames, and not their blocks, give the standard error
+    over several folds: frames differ by more than their parts do. After k of K folds a candidate wins early by √(K/k)
+    times the errors that it needs in the end, as group-sequential trials do (O'Brien & Fleming 1979), whether frames or
+    blocks give them. by: how unseen frames came about; beside: other names that a candidate must win against, too.
+    surely, least: whether a gain must be sure, and the practical size that it must have. Where another score has told
+    that it is sure, its size is enough; where another has told its size (`least` is 0), it need only be sure.
     """
     require(len(candidates) > 0, "a selection needs at least one candidate, but there is none.")
     began, best, compared = time.perf_counter(), candidates[0], list[Compared]()
     for candidate in candidates[1:]:
         rivals = (best, *(beside or {}).get(candidate, ()))
         found = _weakest(candidate, rivals, score, range(1), least)
-        for last in range(1, folds):
-            if found.open:
-                found = _weakest(candidate, rivals, score, range(last + 1), least)
+        for looked in range(1, folds):
+            if not found.open or _wins_early(candidate, rivals, score, (looked, folds), least):
+                break
+            found = _weakest(candidate, rivals, score, range(looked + 1), least)
         compared.append(found)
         if found.wins or (found.large and not surely):
             best = candidate
@@ -227,3 +233,17 @@ def _weakest(
         if not found[-1].open:
             return found[-1]
     return min(found, key=lambda each: each.gain - ERRORS * each.error)
+
+
+def _wins_early(
+    candidate: str, rivals: Sequence[str], score: Callable[[str, int], Score], looked: tuple[int, int], least: float
+) -> bool:
+    """Whether a candidate wins against all rivals by the first folds of several; looked: their number, and of all."""
+    first, every = looked
+    strict = math.sqrt(every / first)
+    for rival in rivals:
+        mine, theirs = (Score.joined([score(name, fold) for fold in range(first)]) for name in (candidate, rival))
+        for gain, error in (mine.gain_over(theirs), mine.by_frames.gain_over(theirs.by_frames)):
+            if not Compared(candidate, gain, strict * error, least).wins:
+                return False
+    return True
