@@ -68,7 +68,7 @@ class ProfileOptions:
     doubt: Share = 0.01
     """Part of the contrast (rms) that counts as noise besides: without any, a fit would not come to its end."""
     iterations: Natural = 30
-    """Iterations of each of two rounds, whose second takes the level of matter from the first."""
+    """Iterations of each fit, whose level of matter is that of the volume it begins with."""
     start: HolographicTV = field(
         default_factory=lambda: HolographicTV(
             retrieval=40, iterations=100, corrections=2, noisy=1.0, refine=1, upper=0.0
@@ -97,7 +97,7 @@ class Profile:
     """-log of the likelihood of the coarse frames of a task, as a function of constants; the volume is the likeliest.
 
     ratio: δ/β at the nominal energy, where it is not among the constants; nominal: the constants by which the support
-    is found; corners: constants whose fringes may be the finest, or the widest: samples of waves a pixel are those that
+    is found, and the volume that each fit begins with, so that fits differ by their constants alone; corners: constants whose fringes may be the finest, or the widest: samples of waves a pixel are those that
     they need, the same for all constants, or the misfit would jump where their number changes.
     """
 
@@ -119,6 +119,8 @@ class Profile:
         self._energy = self._scan.exposures.reference_energy
         self._beyond = (0, 0)
         self._samples = max(fringe_sampling(self._exposed(c).exposures, voxels=1) for c in [nominal, *corners])
+        self._nominal = nominal
+        self._begun: Tensor | None = None
         with memory_kept():
             whole = self._volume(self.frames(nominal))
             self._beyond = margins_of(whole.grid, self._scan.views)
@@ -189,22 +191,26 @@ class Profile:
     def _of(self, chosen: np.ndarray) -> Profile:
         part = copy(self)
         part._scan, part._noise = self._scan[np.flatnonzero(chosen)], self._noise[np.flatnonzero(chosen)]
+        part._begun = None
         return part
 
     def fitted(self, constants: Constants) -> tuple[Tensor, float]:
         """The likeliest volume in the support, and ½ χ² and prior."""
         with memory_kept():
-            frames, options = self.frames(constants), self.options
-            u = self._placed(self._volume(frames)) * self.support
-            on = frames.instrument.device
-            values = [frames(torch.zeros(len(frames.field), *frames.field.shape, device=on)).value]
-            u = u.to(on)
-            for _ in range(2):
-                if bool((u > 0).any()):
-                    level = self._peak * float(u.sum() / self.support.sum())
-                    problem = VolumeProblem(frames, options.prior, level, options.start.backend, self.support)
-                    u, values = descend(problem, u, options.iterations)
-            return u, values[-1]
+            if self._begun is None:
+                frames = self.frames(self._nominal)
+                u = (self._placed(self._volume(frames)) * self.support).to(frames.instrument.device)
+                self._begun, _ = self._descended(frames, u)
+            return self._descended(self.frames(constants), self._begun)
+
+    def _descended(self, frames: WhitenedFrames, u: Tensor) -> tuple[Tensor, float]:
+        """The likeliest volume from `u` on, and its objective."""
+        if not bool((u > 0).any()):
+            return u, frames(torch.zeros(len(frames.field), *frames.field.shape, device=u.device)).value
+        level = self._peak * float(u.sum() / self.support.sum())
+        problem = VolumeProblem(frames, self.options.prior, level, self.options.start.backend, self.support)
+        u, values = descend(problem, u, self.options.iterations)
+        return u, values[-1]
 
 
 def exposed(scan: Scan, constants: Constants) -> Scan:
