@@ -97,8 +97,9 @@ class Profile:
     """-log of the likelihood of the coarse frames of a task, as a function of constants; the volume is the likeliest.
 
     ratio: δ/β at the nominal energy, where it is not among the constants; nominal: the constants by which the support
-    is found, and the volume that each fit begins with, so that fits differ by their constants alone; corners: constants whose fringes may be the finest, or the widest: samples of waves a pixel are those that
-    they need, the same for all constants, or the misfit would jump where their number changes.
+    is found, and the volume that each fit begins with, so that fits differ by their constants alone; corners: constants
+    whose fringes may be the finest, or the widest: samples of waves a pixel are those that they need, the same for all
+    constants, or the misfit would jump where their number changes.
     """
 
     def __init__(
