@@ -68,7 +68,7 @@ class ProfileOptions:
     doubt: Share = 0.01
     """Part of the contrast (rms) that counts as noise besides: without any, a fit would not come to its end."""
     iterations: Natural = 30
-    """Iterations of each fit, whose level of matter is that of the volume it begins with."""
+    """Iterations of each of two rounds, whose second takes the level of matter from the first. All δ/β share it."""
     start: HolographicTV = field(
         default_factory=lambda: HolographicTV(
             retrieval=40, iterations=100, corrections=2, noisy=1.0, refine=1, upper=0.0
@@ -97,9 +97,8 @@ class Profile:
     """-log of the likelihood of the coarse frames of a task, as a function of constants; the volume is the likeliest.
 
     ratio: δ/β at the nominal energy, where it is not among the constants; nominal: the constants by which the support
-    is found, and the volume that each fit begins with, so that fits differ by their constants alone; corners: constants
-    whose fringes may be the finest, or the widest: samples of waves a pixel are those that they need, the same for all
-    constants, or the misfit would jump where their number changes.
+    is found; corners: constants whose fringes may be the finest, or the widest: samples of waves a pixel are those that
+    they need, the same for all constants, or the misfit would jump where their number changes.
     """
 
     def __init__(
@@ -121,7 +120,7 @@ class Profile:
         self._beyond = (0, 0)
         self._samples = max(fringe_sampling(self._exposed(c).exposures, voxels=1) for c in [nominal, *corners])
         self._nominal = nominal
-        self._begun: Tensor | None = None
+        self._begun = dict[tuple[tuple[str, float], ...], Tensor]()
         with memory_kept():
             whole = self._volume(self.frames(nominal))
             self._beyond = margins_of(whole.grid, self._scan.views)
@@ -192,17 +191,24 @@ class Profile:
     def _of(self, chosen: np.ndarray) -> Profile:
         part = copy(self)
         part._scan, part._noise = self._scan[np.flatnonzero(chosen)], self._noise[np.flatnonzero(chosen)]
-        part._begun = None
+        part._begun = {}
         return part
 
     def fitted(self, constants: Constants) -> tuple[Tensor, float]:
         """The likeliest volume in the support, and ½ χ² and prior."""
         with memory_kept():
-            if self._begun is None:
-                frames = self.frames(self._nominal)
-                u = (self._placed(self._volume(frames)) * self.support).to(frames.instrument.device)
-                self._begun, _ = self._descended(frames, u)
-            return self._descended(self.frames(constants), self._begun)
+            return self._descended(self.frames(constants), self._start(constants))
+
+    def _start(self, constants: Constants) -> Tensor:
+        """What a fit begins with: a volume of the nominal δ/β, which waves between matter and detector depend on less
+        than on all others."""
+        key = tuple((name, value) for name, value in constants.items() if name != "delta_beta")
+        if key not in self._begun:
+            nominal = {"delta_beta": self._nominal["delta_beta"]} if "delta_beta" in constants else {}
+            frames = self.frames({**constants, **nominal})
+            u = (self._placed(self._volume(frames)) * self.support).to(frames.instrument.device)
+            self._begun[key], _ = self._descended(frames, u)
+        return self._begun[key]
 
     def _descended(self, frames: WhitenedFrames, u: Tensor) -> tuple[Tensor, float]:
         """The likeliest volume from `u` on, and its objective."""
