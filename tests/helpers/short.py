@@ -20,7 +20,7 @@ from holosplat.methods.profile import ProfileOptions
 from holosplat.methods.uncertain import likeliest_ratio
 
 QUICK = ProfileOptions(
-    iterations=5, start=HolographicTV(retrieval=15, iterations=30, corrections=0, noisy=1.0, refine=1, upper=0.0)
+    iterations=10, start=HolographicTV(retrieval=15, iterations=30, corrections=0, noisy=1.0, refine=1, upper=0.0)
 )
 """Volumes of few steps, whose likelihood says what that of the usual ones does of small frames without noise."""
 
