@@ -329,9 +329,9 @@ class TrackOptions:
     """Whether halves of the frames are fitted, too, for standard errors: up to four short fits."""
     half: MotionFit = SHORT
     """The fit to a half, from the result: errors are hundredths of a pixel. Halves that are fitted to the end agree on
-    what both have from a known shape (two beams at 24°: volumes off by five standard errors). Where few beams see bodies
-    of unknown shape, halves begin apart and are fitted as all frames are, softly: short fits leave them so (three beams:
-    a tenth of the error that they say)."""
+    what both have from a known shape (two beams at 24°: volumes off by five standard errors). Where few beams see
+    bodies of unknown shape, halves begin apart and are fitted as all frames are, softly: short fits leave them so
+    (three beams: a tenth of the error that they say)."""
 
     def with_effort(self, effort: float) -> TrackOptions:
         """The same with `effort` times the steps, at least one."""
