@@ -203,8 +203,8 @@ def test_what_cannot_be_followed_is_refused(folder):
 
 
 def test_surfaces_of_bodies_in_motion_are_fitted_at_one_time(folder):
-    """From those of the run, whose names they keep, to the frames of that time, which they explain about as well: beside
-    the frames of one time the prior of shapes counts for more than beside those of all."""
+    """From those of the run, whose names they keep, to the frames of that time, which they explain about as well: the
+    prior of shapes counts for more beside the frames of one time than beside those of all."""
     again = ("surface", folder / "run", "--out", folder / "again")
     refused(holosplat(*again), "at one time", f"0 … {TIMES - 1}", "export")
     refused(holosplat(*again, "--time-frame", TIMES), f"0 to {TIMES - 1}")
