@@ -63,7 +63,7 @@ SHAPE, PIXEL, PHOTONS = (128, 96), 0.5e-6, 1000.0
 MATERIAL = hs.materials.HAEMOGLOBIN.delta_beta(20.0)
 TURN = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
 """Takes the flow, along x in the files, to the rotation axis y."""
-PRIORS = ("none", "acceleration", "volume_kept", "area_kept", "bending", "apart", "stiffness")
+PRIORS = ("none", "acceleration", "volume_kept", "area_kept", "curvature", "apart", "stiffness")
 """What an ablation leaves out, one at a time; none: nothing."""
 FOLLOWED = 1e-6
 """A cell counts as followed if some body's centre stays within this distance [m], in the median over times."""
@@ -210,11 +210,7 @@ def options_without(prior: str) -> TrackOptions:
     usual = TrackOptions(intervals=prior == "none")
 
     def freed(fit: MotionFit) -> MotionFit:
-        if prior == "none":
-            return fit
-        if prior == "bending":
-            return replace(fit, objective=replace(fit.objective, bending=0.0))
-        return replace(fit, **{prior: 0.0})
+        return fit if prior == "none" else replace(fit, **{prior: 0.0})
 
     return replace(usual, stiff=freed(usual.stiff), soft=freed(usual.soft))
 

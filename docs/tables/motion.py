@@ -22,6 +22,7 @@ LEFT_OUT = {
     "area_kept": "area kept",
     "apart": "no overlap",
     "bending": "bending",
+    "curvature": "smooth shapes",
     "stiffness": "stiff steps",
 }
 """What rows of an ablation leave out, and how the page calls it."""
@@ -102,7 +103,7 @@ def ablation() -> str:
     """One prior left out at a time."""
     rows = {row["without"]: row for row in read("motion_ablation.csv")}
     lines = []
-    for name, said in LEFT_OUT.items():
+    for name, said in ((name, said) for name, said in LEFT_OUT.items() if name in rows):
         row = rows[name]
         lines.append(
             [

@@ -141,3 +141,11 @@ def test_a_step_looks_at_its_frames_some_at_a_time():
     every = Batches(7, Schedule(), torch.device("cpu"), torch.Generator(), None)
     assert [(part, share) for part, share in every.parts(whole)] == [(whole, 1.0)]
     assert isinstance(whole, Batch)
+
+
+def test_where_the_objective_bends_down_steps_are_as_long_as_the_rate():
+    """Far from its minimum log(1 + x²) has a second derivative below zero, and its slope falls with the distance."""
+    of = optimiser(torch.tensor([40.0], dtype=torch.float64))
+    values = steps(of, lambda x: (1 + x.square()).log().sum(), 60)
+    assert values[30] < values[0] - 1
+    assert values[-1] < 1e-9

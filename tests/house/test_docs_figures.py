@@ -66,7 +66,12 @@ def test_an_empty_table_takes_nothing_with_it(figures):
 
 
 TABLE = re.compile(r"^\|.*\n\| ---.*\n((?:\|.*\n)+)", re.MULTILINE)
-DECLARED = {"docs/simulation.md": "| option | views |", "docs/notebook/thesis_study.md": "| the thesis | here |"}
+DECLARED = {
+    "docs/simulation.md": "| option | views |",
+    "docs/notebook/thesis_study.md": "| the thesis | here |",
+    "docs/motion.md": "| prior | option |",
+    "docs/notebook/motion.md": "| prior | option |",
+}
 """Tables of settings, which nobody measured."""
 WHOLE = "docs/notebook/benchmark_tables.md"
 """The page that docs/pictures/benchmark.py writes from docs/data as a whole."""

@@ -90,7 +90,7 @@ def test_senseless_fits_are_refused(few_views, monkeypatch):
         (lambda: SurfaceFit(rate=0.0), "rate must be a positive number of pixels"),
         (lambda: Schedule(decay=0.0), "decay must be a positive number"),
         (lambda: Schedule(steps=-1), "steps must not be negative"),
-        (lambda: Objective(bending=-1.0), "bending must not be negative"),
+        (lambda: Objective(tv_volume=-1.0), "tv_volume must not be negative"),
         (lambda: SurfaceFit(curvature=-1.0), "curvature must not be negative"),
         (lambda: SurfaceFit(stiffness=-1.0), "stiffness must not be negative"),
     ):

@@ -19,7 +19,7 @@ from holosplat.motion.body_tracker import BodyTracker, Followed
 from holosplat.motion.detections import joined, only
 from holosplat.motion.elastic import Rest, RestShapeKept
 from holosplat.motion.expected import Expected, NearExpected
-from holosplat.motion.fit import fitted_bodies, motion_fit
+from holosplat.motion.fit import MotionFit, fitted_bodies, motion_fit
 from holosplat.motion.forecast import Forecast
 from holosplat.motion.track import TrackOptions, follow
 from holosplat.representations import MovingSurfaces
@@ -183,7 +183,7 @@ def test_a_fit_is_drawn_to_the_forecast():
     faint, start = Matter.one(1e-6 * MATERIAL.delta, 1e-6 * MATERIAL.beta), of.on(true_paths().basis)
     way = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
     beside = MovingSurfaces(start.coefficients + way, start.faces, start.of_body, start.basis, PIXEL, faint)
-    how = replace(TrackOptions().soft, objective=replace(TrackOptions().soft.objective, bending=0.0))
+    how = MotionFit(curvature=0.0)
     before, drawn, left = (
         of.deviation(each)
         for each in (

@@ -8,10 +8,10 @@ import torch
 
 from helpers.moving_ellipsoids import MATERIAL, PIXEL, true_paths, truth
 from holosplat.fit.problem import Batch
+from holosplat.fit.terms.object import CurvatureVariation
 from holosplat.matter import Matter
-from holosplat.motion.elastic import Acceleration, Apart, MovingBending, area_kept, square_root, volume_kept
+from holosplat.motion.elastic import Acceleration, Apart, MovingCurvature, area_kept, volume_kept
 from holosplat.representations import MovingSurfaces, TimeBasis
-from holosplat.representations.isosurface import neighbour_mean
 from holosplat.specimens.red_cells import icosphere
 
 
@@ -25,15 +25,23 @@ class Fake:
         return {"object.coefficients": self.paths}
 
 
-def test_bending_in_time_is_the_mean_over_times():
-    """The term against the sum over times of the surfaces there, and its gradient against finite differences."""
+def test_smoothness_in_time_is_the_mean_over_times():
+    """A body that only moves costs what it does at rest, and one that changes the mean of its shapes; gradients of all
+    terms against finite differences."""
     body, times = true_paths(), truth().times
-    away = np.eye(body.coefficients.shape[1]) - neighbour_mean(body.faces.numpy(), body.coefficients.shape[1]).toarray()
-    wanted = np.mean([((away @ away @ body.at(t).vertices.numpy()) ** 2).sum() for t in times])
 
-    term, paths = MovingBending(1.0, body, times), body.coefficients.clone().requires_grad_()
+    def energy_at(time: float) -> float:
+        of = CurvatureVariation(1.0, body.at(0.5 * (body.basis.first + body.basis.last)))
+        return float(of.energy(body.at(time).vertices))
+
+    shown = np.linspace(body.basis.first, body.basis.last, body.basis.count + 1)
+    term, paths = MovingCurvature(1.0, body), body.coefficients.clone().requires_grad_()
     (part,) = term(Fake(paths), None)  # type: ignore[arg-type]
-    assert float(part.value.detach()) == pytest.approx(wanted)
+    assert float(part.value.detach()) == pytest.approx(np.mean([energy_at(t) for t in shown]))
+    still = balls((0.0, 0, 0)).coefficients + torch.tensor([0.0, 9.0])[:, None, None]
+    (part,) = MovingCurvature(1.0, balls((0.0, 0, 0)))(Fake(still), None)  # type: ignore[arg-type]
+    alone = balls((0.0, 0, 0)).at(0.0)
+    assert float(part.value) == pytest.approx(float(CurvatureVariation(1.0, alone).energy(alone.vertices)))
     for made in (term, Acceleration(1.0, body), volume_kept(1.0, body, times), area_kept(1.0, body, times)):
         paths.grad = None
         made(Fake(paths), None)[0].value.backward()  # type: ignore[arg-type]
@@ -41,6 +49,17 @@ def test_bending_in_time_is_the_mean_over_times():
         ends = [float(made(Fake(paths.detach() + s * way), None)[0].value) for s in (1e-4, -1e-4)]  # type: ignore[arg-type]
         assert paths.grad is not None
         assert float((paths.grad * way).sum()) == pytest.approx((ends[0] - ends[1]) / 2e-4, rel=3e-3)
+
+
+def test_bodies_of_any_number_of_vertices_count_alike_where_paths_bend():
+    """Two balls, one of many triangles, whose middles go as t² and 3 t² [pixels]: Σ of the squares of 2 and 6."""
+    basis, times = TimeBasis(0.0, 1.0, 2), np.linspace(0, 1, 5)
+    (few, own), (many, others) = icosphere(1), icosphere(2)
+    way = times[:, None, None] ** 2 * np.array([1.0, 0, 0])
+    paths = [basis.fitted(times, PIXEL * (ball + size * way)) for ball, size in ((few, 1), (many + 20, 3))]
+    pair = MovingSurfaces.of_bodies(paths, [own, others], basis, PIXEL, Matter.one(*MATERIAL))
+    (part,) = Acceleration(1.0, pair)(Fake(pair.coefficients), None)  # type: ignore[arg-type]
+    assert float(part.value) == pytest.approx(2**2 + 6**2)
 
 
 def grown(rates, sizes_at, times):
@@ -126,9 +145,3 @@ def test_the_gradient_of_the_overlap_parts_bodies():
     pulls = [paths.grad[0][pair.body(k)[0]].sum(0) for k in range(2)]
     towards = torch.tensor([5.0, 3.0, 1.0], dtype=torch.float64)
     assert float(pulls[0] @ towards) > 0 > float(pulls[1] @ towards)
-
-
-def test_a_square_root_squared_is_the_matrix():
-    matrix = TimeBasis(0.0, 1.0, 3, 2).gram(np.linspace(0, 1, 7))
-    root = square_root(matrix)
-    assert root.T @ root == pytest.approx(matrix)

@@ -33,12 +33,12 @@ from holosplat.motion.track import TrackOptions, follow
 from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.specimens.red_cells import icosphere
 
-QUICK = TrackOptions().with_effort(0.3)
+QUICK = TrackOptions().with_effort(0.5)
 
 
 @cache
 def followed():
-    """What the frames give in a third of the steps. The first look at each time sees the largest body alone: the others
+    """What the frames give in half of the steps. The first look at each time sees the largest body alone: the others
     are found beside it."""
     looks = list[int]()
 
@@ -83,7 +83,7 @@ def test_paths_are_right_between_frames():
 
 
 def test_a_fit_pulls_bodies_that_are_moved_back():
-    """All of them by a pixel at the last time, from the true paths; few frames a step."""
+    """All of them by a pixel at the last time, from the true paths; few frames in memory at a time."""
     start = true_paths()
     away = torch.zeros_like(start.coefficients)
     away[-1] = 1.0

@@ -96,10 +96,10 @@ class MotionFlags:
     """The same of its area (0: areas are free)."""
     apart: Weight = 0.2
     """How deep bodies may lie in each other, a standard deviation in pixels (0: as they like)."""
-    acceleration: float = 1e-6
-    """Weight of bent paths (0: as bent as splines can be)."""
-    bending: float = 1.0
-    """Weight of bent surfaces (0: free)."""
+    acceleration: Weight = 0.4
+    """Standard deviation of a body's acceleration, in pixels per squared length of a piece (0: paths are free)."""
+    curvature: Weight = 3.0
+    """Prior of smooth shapes, as `[fit] curvature` of surfaces (0: free)."""
     twins: bool = True
     """Bodies of known shape in two beams are told from others whose shadows have the same size and tilt, by fits."""
     intervals: bool = True

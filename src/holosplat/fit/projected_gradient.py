@@ -203,16 +203,14 @@ class QuasiNewton:
         else:
             promised = self._length * float((self._slope * self._way).sum())
             if value <= self._values[-1] + SUFFICIENT * promised:
-                self._pairs = [*self._pairs[len(self._pairs) + 1 - self._memory :], self._pair(trial, slope)]
+                step, change = trial - self._point, slope - self._slope
+                if product(step, change) > BENT * float(step.norm() * change.norm()):  # else no minimum lies ahead
+                    self._pairs = [*self._pairs[len(self._pairs) + 1 - self._memory :], (step, change)]
                 self._accept(trial, slope, value)
             else:
                 self._shorten(value - self._values[-1], promised)
         assert self._point is not None
         leaf.copy_(self._point + self._length * self._way)
-
-    def _pair(self, trial: Tensor, slope: Tensor) -> tuple[Tensor, Tensor]:
-        assert self._point is not None
-        return trial - self._point, slope - self._slope
 
     def _accept(self, point: Tensor, slope: Tensor, value: float) -> None:
         self._point, self._slope = point, slope

@@ -15,18 +15,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.sparse import csr_array, eye_array
 from scipy.spatial import KDTree
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from ..checks import require
 from ..fit.problem import Batch, LossPart
-from ..fit.terms.object import squared_product
+from ..fit.terms.object import CurvatureVariation
 from ..mesh import TriangleMesh
 from ..model import Model
-from ..representations import MovingSurfaces
-from ..representations.isosurface import neighbour_mean
+from ..representations import MovingSurfaces, TimeBasis
 from ..specimens.membrane.model import Elasticity, Membrane
 
 BENDING, AREA = 8e-3, 345.0
@@ -99,6 +97,11 @@ class OfPaths(ABC):
         """[] of the coefficients `paths` [K, P, 3] [pixels]."""
 
 
+def spread(basis: TimeBasis) -> Tensor:
+    """[K + 1, K]: weights of the K coefficients of a path at one more times, evenly from its first to its last."""
+    return torch.from_numpy(basis.weights(np.linspace(basis.first, basis.last, basis.count + 1)))
+
+
 class RestShapeKept(OfPaths):
     """Σ over bodies of the mean over time of their elastic energy beside their rest shape."""
 
@@ -111,8 +114,7 @@ class RestShapeKept(OfPaths):
         self._nodes = self._count * nodes
         faces = torch.cat([rest.faces + k * nodes for k in range(self._count)])
         require(torch.equal(faces, start.faces[: len(faces)]), "bodies of a known rest shape must have its triangles.")
-        instants = torch.linspace(start.basis.first, start.basis.last, start.basis.count + 1, dtype=torch.float64)
-        self._weights = torch.from_numpy(start.basis.weights(instants.numpy()))
+        self._weights = spread(start.basis)
 
     def value(self, paths: Tensor, batch: Batch) -> Tensor:
         """As the class says."""
@@ -152,34 +154,33 @@ Size = Callable[[Tensor, Tensor, Tensor], Tensor]
 """What triangles of the corners a, b, c [F, 3] add to a size of a body: [F]."""
 
 
-class MovingBending(OfPaths):
-    """The mean over times of Σ |L² x|² of the vertices x [pixels], L x their distance from their neighbours' mean."""
+class MovingCurvature(OfPaths):
+    """The mean over time of the energy of `CurvatureVariation`, all bodies together."""
 
-    def __init__(self, weight: float, start: MovingSurfaces, times: np.ndarray) -> None:
-        """times: [T] s, over which the mean is taken."""
-        super().__init__("bending", weight)
-        count = start.coefficients.shape[1]
-        away = csr_array(eye_array(count) - neighbour_mean(start.faces.numpy(), count))
-        operator = csr_array(away @ away)
-        self._operators = operator, csr_array(operator.T)
-        self._root = torch.from_numpy(square_root(start.basis.gram(times)))
+    def __init__(self, weight: float, start: MovingSurfaces) -> None:
+        super().__init__("curvature", weight)
+        self._energy = CurvatureVariation(1.0, start.at(0.5 * (start.basis.first + start.basis.last))).energy
+        self._weights = spread(start.basis)
 
     def value(self, paths: Tensor, batch: Batch) -> Tensor:
         """As the class says."""
-        return squared_product(torch.einsum("kl,lpx->pkx", self._root, paths).flatten(1), *self._operators)
+        return self._energy(torch.einsum("tk,kpx->tpx", self._weights, paths)).mean()
 
 
 class Acceleration(OfPaths):
-    """The mean over vertices of the squared coefficients of their acceleration [pixels² per piece⁴]."""
+    """Σ over bodies of the mean over vertices of the squared coefficients of acceleration [pixels² per piece⁴]."""
 
     def __init__(self, weight: float, start: MovingSurfaces) -> None:
         super().__init__("acceleration", weight)
         self._curvature = torch.from_numpy(start.basis.curvature())
+        self._shares = torch.zeros(start.coefficients.shape[1], 1, dtype=torch.float64)
+        for own, _ in map(start.body, range(start.count)):
+            self._shares[own] = 1 / len(own)
 
     def value(self, paths: Tensor, batch: Batch) -> Tensor:
         """As the class says."""
         bent: Tensor = torch.einsum("jk,kpx->jpx", self._curvature, paths)
-        return bent.square().sum() / paths.shape[1]
+        return (self._shares * bent.square()).sum()
 
 
 class SizeKept(OfPaths):
@@ -218,12 +219,6 @@ volume_kept = partial(SizeKept, "volume_kept", _tetrahedra)
 """The penalty on changes of the volume of each body, of a weight, a start and times."""
 area_kept = partial(SizeKept, "area_kept", _triangles)
 """The same of its area."""
-
-
-def square_root(gram: np.ndarray) -> np.ndarray:
-    """R [K, K] with Rᵀ R = `gram` [K, K], positive semi-definite."""
-    values, axes = np.linalg.eigh(gram)
-    return np.sqrt(np.maximum(values, 0))[:, None] * axes.T
 
 
 class Apart(OfPaths):

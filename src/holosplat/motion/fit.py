@@ -1,4 +1,4 @@
-"""The fit of moving surfaces to the frames of all times, a few frames a step, and the pieces of their paths: as many as
+"""The fit of moving surfaces to the frames of all times, and the pieces of their paths: as many as
 predict frames that a short fit has not seen."""
 
 from __future__ import annotations
@@ -12,24 +12,22 @@ from scipy.sparse import csc_array, diags_array, eye_array
 from scipy.sparse.linalg import splu
 from torch import Tensor
 
-from ..checks import require
 from ..fit.loop import Fit, Plan
-from ..fit.optimiser import Adam, Group, Leaves, Optimiser
 from ..fit.problem import Problem, Schedule, Term
 from ..fit.projected_gradient import QuasiNewton
 from ..fit.run import Run
 from ..fit.terms import Objective
+from ..fit.terms.frames import ProfileLikelihood
 from ..inference import Compared, Decision, Score
-from ..methods.ground import Ground, ground
-from ..methods.surface_fit import BETAS, EPSILON, oversampling
+from ..methods.ground import ground
+from ..methods.surface_fit import MEMORY, oversampling
 from ..optics.background import Light
-from ..optics.noise import noise_share
 from ..ranges import Degree, Natural, Positive, Several, Weight, ranged
 from ..representations import MovingSurfaces
 from ..representations.isosurface import adjacency
 from ..scan import Scan
 from .detections import predicted
-from .elastic import COEFFICIENTS, Acceleration, Apart, MovingBending, Rest, RestShapeKept, area_kept, volume_kept
+from .elastic import COEFFICIENTS, Acceleration, Apart, MovingCurvature, Rest, RestShapeKept, area_kept, volume_kept
 from .expected import Expected, NearExpected
 
 OPEN = 1e-3
@@ -43,32 +41,29 @@ class MotionFit:
     """Options of a fit of moving surfaces."""
 
     rate: Positive = 0.2
-    """Length of the first steps [pixels], the same for all vertices; a tenth of the longest one of L-BFGS."""
-    pairs: int = 0
-    """Pairs of steps that L-BFGS remembers, whose steps look at all frames (0: steps are Adam's)."""
+    """Length of the first step [pixels], of the coefficient that moves most; others are ten times as long at most."""
     worth: Weight = 5.0
-    """Least log-likelihood gain of a step of L-BFGS [nats], averaged over ten, for the fit to continue."""
+    """Least log-likelihood gain of a step [nats], averaged over ten, for the fit to continue."""
     stiffness: Weight = 10.0
     """How far a vertex draws its neighbours along, λ of Nicolet et al. (2021)."""
-    acceleration: float = 1e-6
-    """Weight of bent paths: the sum of squared coefficients of acceleration [pixels² per piece⁴]."""
+    acceleration: Weight = 0.4
+    """Standard deviation of a body's acceleration, rms over its vertices [pixels per piece²] (0: paths are free)."""
     volume_kept: Weight = 0.006
     """Standard deviation of a body's volume over time, as a share (0: volumes are free). Of red cells it is that."""
     area_kept: Weight = 0.03
     """The same of its area: red cells in flow change theirs by 1 to 5 % (0: areas are free)."""
     apart: Weight = 0.2
     """How deep bodies may lie in each other, a standard deviation [pixels] (0: unconstrained)."""
-    objective: Objective = field(
-        default_factory=lambda: Objective(l1=0.0, rounded=1.0, rounding=3.0, bending=1.0, noise_gain=3.0)
-    )
-    """How frames are compared, and what bending costs."""
-    schedule: Schedule = field(default_factory=lambda: Schedule(steps=100, views_per_step=16))
-    """The loop; memory is that of the frames of one step, of which L-BFGS takes several for one of its own."""
+    curvature: Weight = 3.0
+    """Prior of smooth shapes: κ of ½ κ R² ∫ |∇H|² dA of each body, the mean over time [nats], as of `SurfaceFit`."""
+    objective: Objective = field(default_factory=lambda: Objective(l1=0.0, rounded=1.0, rounding=3.0))
+    """How frames are compared; their noise is what the surfaces leave of each view."""
+    schedule: Schedule = field(default_factory=lambda: Schedule(steps=120, views_per_step=16))
+    """The loop; `views_per_step` are in memory at a time, for steps look at all."""
 
 
-def converged() -> MotionFit:
-    """A fit by L-BFGS, which ends when it gains nothing more."""
-    return MotionFit(pairs=20, schedule=Schedule(steps=120, views_per_step=16, decay=1.0))
+SHORT = MotionFit(rate=0.1, schedule=Schedule(steps=10, views_per_step=16))
+"""A fit that hardly leaves its start."""
 
 
 def motion_fit(
@@ -85,29 +80,20 @@ def motion_fit(
 
     rest: the known shape of bodies at rest; expected: where a forecast has the first of the bodies.
 
-    Steps are Adam's, of one length for all vertices, or those of L-BFGS, in coordinates in which neighbours move
-    together (Nicolet et al. 2021) and in which times count alike: the paths' Gram matrix over the times is one.
+    Steps are those of L-BFGS, in coordinates in which neighbours move together (Nicolet et al. 2021) and in which times
+    count alike: the paths' Gram matrix over the times is one.
     """
-    train, schedule = scan.train(), options.schedule
-    if options.pairs or 0 < len(train) <= schedule.views_per_step:
-        schedule = replace(schedule, views_per_step=0, views_at_once=schedule.views_per_step)
+    train, at_once = scan.train(), options.schedule.views_per_step
+    schedule = replace(options.schedule, views_per_step=0, views_at_once=at_once)
     finer = oversampling(train) if not schedule.oversample else 0
     base = ground(scan, start, start.matter, options.objective, schedule, "cpu", finer=finer, light=light)
-    times = base.train.exposures.time
-    smooth, worth = _smooth_directions(start, options.stiffness, times), options.worth * _of_likelihood(base)
-    group = Group(BETAS, EPSILON, solve=smooth, together=True)
-
-    def optimiser(leaves: Leaves) -> Optimiser:
-        if options.pairs:
-            return QuasiNewton(leaves, smooth, options.pairs, worth)
-        return Adam(leaves, "cpu", {COEFFICIENTS: group})
-
-    prior = (*_at_rest(base, start, rest, expected), *_near(base, start, expected))
+    frames = ProfileLikelihood(base.frames, int(base.train.measured.isfinite().sum()))
+    smooth = _smooth_directions(start, options.stiffness, base.train.exposures.time)
     plan = Plan(
-        problem=Problem(base.model, (base.frames, *_terms(base, start, options), *prior)),
+        problem=Problem(base.model, (frames, *_prior(base.train, start, options, rest, expected, frames.nat))),
         schedule=schedule,
-        optimiser=optimiser,
-        rates=lambda factor, step: {COEFFICIENTS: options.rate * factor},
+        optimiser=lambda leaves: QuasiNewton(leaves, smooth, MEMORY, options.worth * frames.nat),
+        rates=lambda factor, step: {COEFFICIENTS: options.rate},
         judge=base.judge,
     )
     return Fit(plan, seed)
@@ -121,53 +107,26 @@ def fitted_bodies(fit: Fit) -> MovingSurfaces:
     return found
 
 
-def _terms(base: Ground, start: MovingSurfaces, options: MotionFit) -> list[Term]:
-    frames, wanted, times = base.train.measured, options.objective, base.train.instants
-    found: list[Term] = []
-    if wanted.bending > 0:
-        weight = wanted.bending * (1 + wanted.noise_gain * noise_share(frames)) / frames[0].numel()
-        found.append(MovingBending(weight, start, times))
+def _prior(
+    train: Scan, start: MovingSurfaces, options: MotionFit, rest: Rest | None, expected: Expected | None, nat: float
+) -> list[Term]:
+    """Minus the logarithms of the prior's parts: a shape counts once, what changes of it in time as one draw of each
+    coefficient. nat: a unit of them, in units of the loss."""
+    one, found, moves = nat * start.basis.count, list[Term](), start.basis.count > 1
+    if options.curvature > 0:
+        found.append(MovingCurvature(nat * options.curvature, start))
     if options.acceleration > 0 and len(start.basis.curvature()):
-        found.append(Acceleration(options.acceleration, start))
-    moves = start.basis.count > 1
+        found.append(Acceleration(nat / 2 / options.acceleration**2, start))
     for kept, deviation in ((volume_kept, options.volume_kept), (area_kept, options.area_kept)):
         if deviation > 0 and moves:
-            found.append(kept(_of_likelihood(base) * start.basis.count / 2 / deviation**2, start, times))
+            found.append(kept(one / 2 / deviation**2, start, train.instants))
     if options.apart > 0 and start.count > 1:
-        found.append(
-            Apart(_of_likelihood(base) * start.basis.count / 2 / options.apart**2, start, base.train.exposures.time)
-        )
+        found.append(Apart(one / 2 / options.apart**2, start, train.exposures.time))
+    if rest is not None and rest.stiffness > 0:  # of the bodies of a forecast alone, where that tells it
+        found.append(RestShapeKept(one * rest.stiffness, rest.elastic, start, expected and expected.count))
+    if expected is not None:  # its errors count as one number a body and coefficient of time
+        found.append(NearExpected(one / 2, expected, start.basis))
     return found
-
-
-def _at_rest(base: Ground, start: MovingSurfaces, rest: Rest | None, expected: Expected | None) -> list[Term]:
-    """The prior of a shape at rest: of the bodies of a forecast alone, where that tells it."""
-    if rest is None or rest.stiffness == 0:
-        return []
-    weight, count = rest.stiffness * _of_likelihood(base) * start.basis.count, expected and expected.count
-    return [RestShapeKept(weight, rest.elastic, start, count)]
-
-
-def _near(base: Ground, start: MovingSurfaces, expected: Expected | None) -> list[Term]:
-    """The prior of a forecast, whose errors count as one number a body and coefficient of time."""
-    if expected is None:
-        return []
-    return [NearExpected(_of_likelihood(base) * start.basis.count / 2, expected, start.basis)]
-
-
-def _of_likelihood(base: Ground) -> float:
-    """A unit of minus the logarithm of a probability, in units of the loss of frames.
-
-    That is the mean over N pixels of √(r² + c²) - c, about r²/2c, while it should be the sum of r²/2σ²: σ²/(c N).
-    """
-    width, objective = base.frames.resolved.get("rounding", 0.0), base.frames.objective
-    require(
-        width > 0,
-        "volume_kept, area_kept and apart need frames that are compared by `rounded`; raise its weight, or set all "
-        "three to 0.",
-    )
-    noise = width / objective.rounding
-    return objective.rounded * noise**2 / width / base.train.frames.size
 
 
 def _smooth_directions(start: MovingSurfaces, stiffness: float, times: np.ndarray) -> Callable[[Tensor], Tensor]:

@@ -152,22 +152,20 @@ APART = 0.05
 STRAINED = 10.0
 """Elastic energy by which a twin may exceed its body, in units of its area times the shear modulus: in trials cells in
 flow had up to four, their twins in beams across each other half a unit more, in beams at 24° 28 and more."""
-STIFF_STEPS, SOFT_STEPS, TRIAL_VIEWS = 40, 40, 4
-"""Steps of the two fits of a trial, and frames of a step of Adam's: with a third of these steps a body is not yet at
-home where its twin is."""
+STIFF_STEPS, SOFT_STEPS = 10, 40
+"""Steps of the two fits of a trial at most."""
 FIRST_LOOK = 0.7
 """About the share of the work before the closer ones are looked at again."""
 TRIAL_WORTH = 1.0
-"""What a step of L-BFGS must gain there [nats]: bodies and their twins differ by ten at times."""
+"""What a step must gain there [nats]: bodies and their twins differ by ten at times."""
 SAMPLES = 4
 """Times at which a body that turns is put in its twin's place, for each coefficient of its path."""
 NAME, NONE = "twins in two beams", "none"
 
 
 def trial_of(how: MotionFit, steps: int) -> MotionFit:
-    """`how` in so many steps at most, of few frames, for one body: what it has with others is left out."""
-    views = how.schedule.views_per_step if how.pairs else TRIAL_VIEWS
-    schedule = replace(how.schedule, steps=min(steps, how.schedule.steps), views_per_step=views)
+    """`how` in so many steps at most, for one body: what it has with others is left out."""
+    schedule = replace(how.schedule, steps=min(steps, how.schedule.steps))
     return replace(how, volume_kept=0.0, area_kept=0.0, apart=0.0, worth=TRIAL_WORTH, schedule=schedule)
 
 

@@ -23,7 +23,7 @@ from ..representations import MovingSurfaces, TimeBasis
 from ..scan import Exposures, Scan
 from .elastic import Rest
 from .expected import second_order_field
-from .fit import MotionFit, converged, motion_fit
+from .fit import SHORT, MotionFit, motion_fit
 from .forecast import Halves, early_count, on_paths, places_of
 
 
@@ -198,7 +198,7 @@ def standard_errors(bodies: MovingSurfaces, halves: Sequence[MovingSurfaces], sc
 def half_fit(rest: Rest | None) -> MotionFit:
     """The usual fit to a half: to its end. Of a known shape at rest it is short, for else halves agree on what both
     have from that."""
-    return converged() if rest is None else MotionFit()
+    return MotionFit() if rest is None else SHORT
 
 
 def half_sets(

@@ -19,7 +19,7 @@ from ..mesh import ball_radius
 from ..ranges import Natural, Share, Within, ranged
 from ..representations import MovingSurfaces, TimeBasis
 from .detections import Detection, SightingOptions
-from .fit import MotionFit, PathOptions, converged
+from .fit import SHORT, MotionFit, PathOptions
 
 FAR = 1e9
 """Cost of a pair that cannot be."""
@@ -317,20 +317,20 @@ class TrackOptions:
     fainter: Share = 0.6
     """Factor of the level there: few views smear a body, and beside what is known there is little to take it for."""
     stiff: MotionFit = field(
-        default_factory=lambda: MotionFit(rate=0.4, stiffness=100.0, schedule=Schedule(steps=60, views_per_step=16))
+        default_factory=lambda: MotionFit(rate=0.4, stiffness=100.0, schedule=Schedule(steps=20, views_per_step=16))
     )
     """The first fit, in which bodies move and turn nearly as a whole."""
-    soft: MotionFit = field(default_factory=converged)
+    soft: MotionFit = field(default_factory=MotionFit)
     """The second one, in which they deform."""
 
     twins: bool = True
     """Whether to compare bodies of known shape with others that have the same shadows in two beams."""
     intervals: bool = True
     """Whether halves of the frames are fitted, too, for standard errors: up to four short fits."""
-    half: MotionFit = field(default_factory=lambda: MotionFit(rate=0.1, schedule=Schedule(steps=40, views_per_step=16)))
-    """The fit to a half, from the result: errors are hundredths of a pixel. By Adam: halves that L-BFGS fits to the end
-    agree on what both have from a known shape (two beams at 24°: volumes off by five standard errors). Where few beams
-    see bodies of unknown shape, halves begin apart and are fitted as all frames are, softly: short fits leave them so
+    half: MotionFit = SHORT
+    """The fit to a half, from the result: errors are hundredths of a pixel. Halves that are fitted to the end agree on
+    what both have from a known shape (two beams at 24°: volumes off by five standard errors). Where few beams see
+    bodies of unknown shape, halves begin apart and are fitted as all frames are, softly: short fits leave them so
     (three beams: a tenth of the error that they say)."""
 
     def with_effort(self, effort: float) -> TrackOptions:

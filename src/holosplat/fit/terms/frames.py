@@ -74,10 +74,7 @@ class Objective:
     two_levels: float = 0.0
     """Occupancies between nothing and one; ramped from 0, for at its beginning matter may still be too faint."""
     noise_gain: float = 0.0
-    """What the weights of `two_levels` and `bending` grow by, times the share of the frames' contrast that is noise."""
-    bending: float = 0.0
-    """Bodies in motion: Σ |L² x|² over the pixels of a frame, L x the distance of vertices x from their neighbours'
-    mean."""
+    """What the weight of `two_levels` grows by, times the share of the frames' contrast that is noise."""
 
     def __post_init__(self) -> None:
         compared = sum(getattr(self, name) for name in IMAGE_TERMS)

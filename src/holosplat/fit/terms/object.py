@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -116,36 +115,20 @@ class CurvatureVariation:
 
     def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
         """The one part."""
-        x, (i, j) = model.parameters()["object.vertices"], self._ends
-        a, b, c = (x[self._faces[:, k]] for k in range(3))
-        across = torch.linalg.cross(b - a, c - a).repeat(3, 1)
-        normals = normalize(torch.zeros_like(x).index_add(0, self._faces.T.flatten(), across), dim=1)
-        away = x - torch.zeros_like(x).index_add(0, i, x[j]).index_add(0, j, x[i]) / self._degree
-        along = (normals * away).sum(1)
-        aside = away - normals * along[:, None]
-        change = (along[i] - along[j]).square() + (aside[i] - aside[j]).square().sum(1)
-        return [LossPart("curvature", self._weight, 0.5 * (self._stiffness * change).sum())]
+        return [LossPart("curvature", self._weight, self.energy(model.parameters()["object.vertices"]))]
 
-
-def squared_product(x: Tensor, matrix: csr_array, transposed: csr_array) -> Tensor:
-    """Σ (A x)² [] of x [P, C] on the CPU, differentiable; matrix, transposed: A and Aᵀ."""
-    found = _SquaredProduct.apply(x, matrix, transposed)
-    assert isinstance(found, Tensor)
-    return found
-
-
-class _SquaredProduct(torch.autograd.Function):
-    """Σ (A x)² of a sparse A; torch's own backward pass would transpose A anew in every step."""
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor, matrix: csr_array, transposed: csr_array) -> Tensor:  # type: ignore[override]
-        product = matrix @ x.detach().numpy()
-        ctx.slope = torch.from_numpy(2 * (transposed @ product))
-        return x.new_tensor(np.square(product).sum())
-
-    @staticmethod
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]
-        return upstream * ctx.slope, None, None
+    def energy(self, x: Tensor) -> Tensor:
+        """Energies [...] of the same triangles with vertices x [..., P, 3] in the unit of the start's."""
+        i, j = self._ends
+        a, b, c = (x[..., self._faces[:, k], :] for k in range(3))
+        across, corners = torch.linalg.cross(b - a, c - a), self._faces.T.flatten()
+        normals = normalize(torch.zeros_like(x).index_add(-2, corners, torch.cat([across] * 3, dim=-2)), dim=-1)
+        around = torch.zeros_like(x).index_add(-2, i, x[..., j, :]).index_add(-2, j, x[..., i, :])
+        away = x - around / self._degree
+        along = (normals * away).sum(-1)
+        aside = away - normals * along[..., None]
+        change = (along[..., i] - along[..., j]).square() + (aside[..., i, :] - aside[..., j, :]).square().sum(-1)
+        return 0.5 * (self._stiffness * change).sum(-1)
 
 
 class VoxelVariation:
