@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # threads that spin starve whoever shares the cores
-for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # a problem of the tests is too small for two
-    os.environ.setdefault(name, "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # BLAS's, too: problems of the tests are too small for two
 
 import pytest
 import torch

@@ -50,15 +50,23 @@ def in_few_steps() -> Iterator[None]:
 
 
 FLOW = FlowOptions(
-    SmoothVolume(coarser=(), rounds=1, iterations=4), cells=2, most_cells=2, most_degree=0, steps=2, iterations=3, final=3
+    SmoothVolume(coarser=(), rounds=1, iterations=4),
+    cells=2,
+    most_cells=2,
+    most_degree=0,
+    steps=2,
+    iterations=3,
+    final=3,
 )
 """A flow that is found fast, and shows that something moves."""
 
 
 @contextlib.contextmanager
 def in_short_fits() -> Iterator[None]:
-    """Within, whatever a command fits takes few steps: first volumes, the likelihood of δ/β, and flows. Bodies in motion
-    are not judged, and other matter is not asked whether it moves."""
+    """Within, whatever a command fits takes few steps: first volumes, the likelihood of δ/β, and flows.
+
+    Bodies in motion are not judged, and other matter is not asked whether it moves.
+    """
     module = import_module("holosplat.baselines.holographic_tv")
 
     def shortened(options: HolographicTV) -> HolographicTV:
