@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # threads that spin starve whoever shares the cores
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # BLAS's, too: problems of the tests are too small for two
 
 import pytest
 import torch

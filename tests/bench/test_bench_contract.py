@@ -14,7 +14,7 @@ from holosplat.model import Instrument, Model
 from holosplat_bench.suite.methods import METHODS, BenchMethod
 from holosplat_bench.suite.run import stored_bytes
 
-pytestmark = pytest.mark.usefixtures("decided")
+pytestmark = pytest.mark.usefixtures("decided", "unjudged_runs")
 
 
 @dataclass

@@ -10,7 +10,7 @@ import holosplat as hs
 from helpers.contract import MATERIAL, PITCH, QUICK, QUICKER, SCENE, SHAPE, run, usable
 from holosplat_bench.suite.methods import METHODS, BenchMethod
 
-pytestmark = pytest.mark.usefixtures("decided")
+pytestmark = pytest.mark.usefixtures("decided", "unjudged_runs")
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from helpers.motion_shadows import OTHER, TURN, cell, pose, shadows
+from holosplat.bodies import neighbourhood_search
 from holosplat.bodies.neighbourhood_search import Pool, pursued
 from holosplat.bodies.poses import FREER, HIDDEN, Explained, Pose
 from holosplat.bodies.shadows import Shadows
@@ -46,7 +47,8 @@ def test_one_body_is_worth_more_than_two_that_hide():
     assert every.value(one) < every.value(ghosts)
 
 
-def test_the_search_leaves_bodies_that_hide():
+def test_the_search_leaves_bodies_that_hide(monkeypatch):
+    monkeypatch.setattr(neighbourhood_search, "PATIENCE", 1)
     truth, beside = still(TURN, TRUTH), still(OTHER, (-6.0, -10.0, 3.0))
     begun = [beside, *(still(TURN, ghost) for ghost in GHOSTS)]
     found, _ = pursued(cell(), at_one_time([truth, beside]), np.zeros((1, 3)), begun)

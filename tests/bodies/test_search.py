@@ -26,6 +26,7 @@ def axis_error(found: Pose, turn: np.ndarray) -> float:
 
 def test_two_beams_find_a_body_and_its_pose(monkeypatch):
     """One cell that the frames cut at the end: centre, velocity and axis; the steps of another run give the same."""
+    monkeypatch.setattr(neighbourhood_search, "PATIENCE", 1)
     truth = pose(TURN, (3.0, 11.0, -2.5), 1.1)
     flow, run = FLOW * np.array([0.9, 1.1])[:, None], Run()
     (found,), of_begun = pursued(cell(), shadows([truth]), flow, run=run)

@@ -14,6 +14,8 @@ from holosplat.metrics import fourier_shell_correlation
 from holosplat.report.compare import Comparison, chosen, differing, in_columns
 from holosplat.report.page import Table
 
+pytestmark = pytest.mark.usefixtures("unjudged_runs")
+
 
 @pytest.fixture(scope="module")
 def coarse(shop: Workshop, tmp_path_factory):

@@ -14,6 +14,8 @@ from holosplat.learning.start import Card, read_weights, write_weights
 from holosplat.methods import Gaussians
 from holosplat.workflows.run_folder import RunFolder
 
+pytestmark = pytest.mark.usefixtures("unjudged_runs")
+
 SMALL = ("--image", "4", "4", "4", "4", "--features", "3", "--volume", "4", "4", "4")
 SCENES = ("--rows", "24", "--columns", "24", "--views", "2", "--held-out", "1", "--across", "8", "10")
 

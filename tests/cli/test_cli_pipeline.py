@@ -19,6 +19,8 @@ from holosplat.cli.help import options_of, parser_of
 from holosplat.cli.pipeline import STAGES
 from holosplat.io.provenance import records
 
+pytestmark = pytest.mark.usefixtures("unjudged_runs")
+
 CUT_SHORT = """
 [reconstruct]
 scan = "scan.nxs"

@@ -18,6 +18,8 @@ from holosplat.cli.places import is_run, is_written
 from holosplat.ranges import hints_of
 from holosplat_bench.cli import bench
 
+pytestmark = pytest.mark.usefixtures("unjudged_runs")
+
 BEAM = ["--detector", "8", "9", "--views", "2"]
 READS = "must not be what the command reads"
 INSIDE = "must be outside of run folders"

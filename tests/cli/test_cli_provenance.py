@@ -19,6 +19,8 @@ from holosplat.cli.entry import is_made_by
 from holosplat.io import hdf5_guard, provenance
 from holosplat.io.provenance import from_home, home_safe, records
 
+pytestmark = pytest.mark.usefixtures("unjudged_runs")
+
 TAKEN = "must be new or empty, but it holds something already"
 
 

@@ -16,6 +16,8 @@ from holosplat.io.vtk import read_meshes
 from holosplat.materials import parse_material
 from holosplat_bench.specimens.matter import CHANGING, MATTER
 
+pytestmark = pytest.mark.usefixtures("unjudged_runs")
+
 FIELD: list[object] = ["--detector", 21, 30, "--pixel-size", "2e-6", "--views", 4]
 
 

@@ -12,6 +12,8 @@ import pytest
 from helpers.cli import holosplat, worked
 from holosplat.cli.entry import COMMANDS, command, is_late
 
+pytestmark = pytest.mark.usefixtures("unjudged_runs")
+
 HEAVY = ("torch", "scipy", "h5py", "xraydb", "vtk", "vtkmodules", "matplotlib", "jinja2", "tifffile", "PIL", "triton")
 LIGHT = (
     *([], ["plan"], ["simulate"], ["reconstruct"], ["render"], ["export"], ["evaluate"], ["demo"], ["backends"]),

@@ -14,6 +14,8 @@ from holosplat.materials import parse_material, require_in_wall, wall_of
 from holosplat.model import measure
 from holosplat.workflows import certainty
 
+pytestmark = pytest.mark.usefixtures("unjudged_runs")
+
 WALL = ("--wall", "tube:12e-6:15e-6:glass:water", "--material", "air", "--medium", "water")
 
 

@@ -60,7 +60,7 @@ def run(page: str, folder: Path, readme: Path | None = None, shell: Path | None 
 
 FEW_STEPS = """import holosplat as hs
 hs.reconstruct = lambda scan, prior, method=hs.methods.Auto(), reconstruct=hs.reconstruct, **how: reconstruct(
-    scan, prior, method.with_effort(0.1), **how)
+    scan, prior, method.with_effort(0.02), **how)
 """
 """What Python reads before a block."""
 

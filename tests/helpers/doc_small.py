@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from helpers.doc_blocks import FAR, Block
@@ -190,7 +190,9 @@ def of_few_steps(folder: Path) -> Path:
     """A file in a folder that shells read before blocks of any page: their commands take few steps of fits, and try few
     instruments."""
     method, shell = folder / "method.json", folder / "shell.sh"
-    method.write_text(json.dumps(to_table(Auto().with_effort(0.1))), encoding="utf-8")
+    auto = Auto().with_effort(0.02)
+    coarse = replace(auto.gaussians.coarse, turns=0, join_missing=False)  # none is missing that so few steps would find
+    method.write_text(json.dumps(to_table(replace(auto, gaussians=replace(auto.gaussians, coarse=coarse)))))
     fits = f"""$(case "$*" in *--method*|*--preset*) ;; *) echo --config {method} ;; esac)"""
     series = """$(case "$2" in plan) echo --preset fast ;; esac)"""
     more = {"plan": "--points 5 3", "reconstruct": fits, "series": series, "track": TRACK}

@@ -4,9 +4,9 @@ loaded PyTorch and the rest: importing takes longer than most of these commands.
     python forked.py SOCKET
 
 serves them; a script `holosplat` in a folder of PATH hands a command over (`served`). Streams, folder, environment and
-exit code are the caller's, and signals reach the command. Torch takes one thread, as in other tests, and light is plain
-(`helpers.unjudged`); with `UNDRAWN` in the environment, figures of reports are blank (`helpers.pictures`), and runs
-are not judged.
+exit code are the caller's, and signals reach the command. Torch takes one thread, as in other tests, light is plain and
+runs are not judged (`helpers.unjudged`), fits are short (`helpers.short`), and figures of reports are blank
+(`helpers.pictures`).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import sys
 import tempfile
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 
 CALL = """#!{python} -IS
@@ -36,9 +36,6 @@ for number in (signal.SIGINT, signal.SIGTERM):
     signal.signal(number, lambda number, _: os.kill(process, number))
 sys.exit(int(answer.readline() or 1))
 """
-
-
-Blank = Callable[[], AbstractContextManager[None]]
 
 
 @contextmanager
@@ -65,18 +62,14 @@ def serve(path: str) -> None:
     import holosplat.report
     import holosplat.workflows.reconstruct  # noqa: F401 - loaded for the commands
     from helpers.pictures import undrawn
+    from helpers.short import in_short_fits
     from helpers.unjudged import in_plain_light, unjudged
     from holosplat.cli import main
-
-    @contextmanager
-    def blank() -> Iterator[None]:
-        with undrawn(), unjudged():
-            yield
 
     torch.set_num_threads(1)
     os.fsync = os.fstat  # what commands write need not survive a power cut
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # children leave no trace
-    with socket.socket(socket.AF_UNIX) as door, in_plain_light():
+    with socket.socket(socket.AF_UNIX) as door, in_plain_light(), unjudged(), in_short_fits(), undrawn(first=False):
         door.bind(path)
         door.listen()
         print("ready", flush=True)
@@ -85,11 +78,11 @@ def serve(path: str) -> None:
             if os.fork() == 0:
                 door.close()
                 signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-                _command(caller, main, blank)
+                _command(caller, main)
             caller.close()
 
 
-def _command(caller: socket.socket, main: Callable[[], None], blank: Blank) -> None:
+def _command(caller: socket.socket, main: Callable[[], None]) -> None:
     """Become the command of a caller, and tell it the exit code."""
     size, streams, *_ = socket.recv_fds(caller, 8, 3)
     words, folder, environment = json.loads(caller.recv(int.from_bytes(size, "big"), socket.MSG_WAITALL))
@@ -102,8 +95,7 @@ def _command(caller: socket.socket, main: Callable[[], None], blank: Blank) -> N
     os.environ.update(environment)
     sys.argv, code = ["holosplat", *words], 1
     try:
-        with blank() if environment.get("UNDRAWN") else nullcontext():
-            main()
+        main()
         code = 0
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else int(end.code is not None)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 
 from helpers.bumpy import surfaces
-from holosplat.beamline.simulate import simulate
+from holosplat.beamline.simulate import Simulation, simulated_frames
 from holosplat.geometry import Grid, Views
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.matter import MaterialPrior
@@ -25,13 +26,27 @@ MATTER = HAEMOGLOBIN.delta_beta(20.0)
 CELLS = random_cells(4, (30.5 * PITCH, 27.4 * PITCH, 30.5 * PITCH), 5, 13.7 * PITCH)
 
 
+class Undetected(Simulation):
+    """Intensities as they come to the detector."""
+
+    def detector(self, exposures: Exposures) -> Callable[[np.ndarray, int], np.ndarray]:
+        return lambda intensity, frame: intensity
+
+
+@cache
+def intensities() -> tuple[Exposures, np.ndarray]:
+    """Sixteen views of cells of 14 pixels, without noise."""
+    scene = MeshScene.of_one_material(CELLS, MATTER)
+    exposures = Exposures.of(Views.evenly_spaced(16, SHAPE, PITCH), 20.0, 0.17, 0.05)
+    return exposures, np.stack([*simulated_frames(scene, exposures, Undetected())])
+
+
 @cache
 def scan_of(photons: float) -> Scan:
-    """Sixteen views of cells of 14 pixels."""
-    scene = MeshScene.of_one_material(CELLS, MATTER)
-    views = Views.evenly_spaced(16, SHAPE, PITCH)
-    exposures = Exposures.of(views, 20.0, 0.17, 0.05)
-    return simulate(scene, exposures, photons_per_pixel=photons, seed=1, is_test=np.zeros(16, dtype=bool))
+    """These views in so many photons a pixel."""
+    exposures, seen = intensities()
+    detect = Simulation(photons, seed=1).detector(exposures)
+    return Scan(np.stack([detect(frame, n) for n, frame in enumerate(seen)]), exposures, np.zeros(16, dtype=bool))
 
 
 def task_of(photons: float) -> Task:

@@ -35,6 +35,13 @@ FIGURES = ("scene", "held_out", "explained", "light", "projections", "slices", "
 _made = set[tuple[str, str]]()
 
 
+def _empty(*_: Any, **__: Any) -> Figure:
+    """With axes that show nothing."""
+    figure = Figure(figsize=(WIDTH, 1))
+    figure.add_axes((0, 0, 1, 1))
+    return figure
+
+
 def _once(name: str, make: Callable[..., Figure]) -> Callable[..., Figure]:
     """`make` for the first report of each file of tests, and a figure with empty axes for the others."""
 
@@ -44,23 +51,21 @@ def _once(name: str, make: Callable[..., Figure]) -> Callable[..., Figure]:
         if place not in _made:
             _made.add(place)
             return make(*arguments, **options)
-        figure = Figure(figsize=(WIDTH, 1))
-        figure.add_axes((0, 0, 1, 1))
-        return figure
+        return _empty()
 
     return made
 
 
 @contextlib.contextmanager
-def undrawn() -> Iterator[None]:
+def undrawn(first: bool = True) -> Iterator[None]:
     """Within, the figures of reports are blank in the page, surfaces are traced coarsely, and each kind of figure is
-    made for the first report of a file of tests.
+    made for the first report of a file of tests; `first=False`: for none.
 
     All else of a report is as ever. tests/report draws, and so do the runs that the tests of the commands share.
     """
     with pytest.MonkeyPatch.context() as patch:
         for name in (f"{figure}_figure" for figure in FIGURES):
-            patch.setattr(blocks, name, _once(name, getattr(blocks, name)))
+            patch.setattr(blocks, name, _once(name, getattr(blocks, name)) if first else _empty)
         patch.setattr("holosplat.report.style.data_uri", _blank)
         patch.setattr("holosplat.report.figures.render_surface", _coarse)
         patch.setattr("holosplat.report.moving_figures.animation", lambda moving: b"still")

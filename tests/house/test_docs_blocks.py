@@ -1,6 +1,6 @@
 """Every block of code in the README and the guide runs as it stands, in an empty folder, on data that blocks make.
 
-Fits of commands take few steps (`helpers.doc_small.of_few_steps`), and figures of reports are blank but in the README.
+Fits of commands take few steps (`helpers.doc_small.of_few_steps`), and figures of reports are blank.
 
 Blocks of the lab notebook (docs/notebook) are parsed only: they show how numbers were made.
 
@@ -83,16 +83,14 @@ def test_the_blocks_of_the_readme_run(readme):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", RUN, ids=name_of)
-def test_the_blocks_of_a_page_run(page, readme, few_steps, tmp_path, monkeypatch):
-    monkeypatch.setenv("UNDRAWN", "1")
+def test_the_blocks_of_a_page_run(page, readme, few_steps, tmp_path):
     run(TEXTS[page], tmp_path, readme, few_steps)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PAGES_SMALL)
-def test_blocks_that_take_long_run_at_a_small_size(name, tmp_path, monkeypatch):
+def test_blocks_that_take_long_run_at_a_small_size(name, tmp_path):
     """With files that stand in for the reader's, fewer pixels, views and steps, and blank figures."""
-    monkeypatch.setenv("UNDRAWN", "1")
     small = PAGES_SMALL[name]
     shell = tmp_path / ".small.sh"
     shell.write_text(small.shell(), encoding="utf-8")

@@ -73,9 +73,9 @@ def test_every_example_is_tested_and_short():
         assert (EXAMPLES / name).read_text(encoding="utf-8").count("\n") <= 60
 
 
-def test_simulate_and_reconstruct(tmp_path):
+def test_simulate_and_reconstruct(run_example, tmp_path):
     """Scores of held-out views and of the volume are printed; scan, run and volume are there to be read."""
-    printed = in_a_process("01_simulate_and_reconstruct.py", "results/first", cwd=tmp_path)
+    printed = run_example("01_simulate_and_reconstruct.py", "results/first")
     out = tmp_path / "results/first"
     ssim, frcm = (float(v) for v in re.findall(r"held-out frames: SSIM ([\d.]+), FRCM ([\d.]+)", printed)[0])
     dice = float(re.findall(r"volume: Dice ([\d.]+)", printed)[0])
@@ -97,9 +97,9 @@ def numbers(pattern: str, printed: str) -> list[float]:
     return [float(value) for value in re.findall(pattern, printed)]
 
 
-def test_own_meshes(run_example, tmp_path):
-    """Meshes of other programs become a scan file and a volume with their three bodies."""
-    printed = run_example("02_own_meshes.py", "out")
+def test_own_meshes(tmp_path):
+    """Meshes of other programs become a scan file and a volume with their three bodies; this one runs as a process."""
+    printed = in_a_process("02_own_meshes.py", "out", cwd=tmp_path)
     assert "3 meshes" in printed
     assert numbers(r"volume: Dice ([\d.]+)", printed)[0] > 0.97
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
@@ -111,6 +111,7 @@ def test_own_meshes(run_example, tmp_path):
     }
 
 
+@pytest.mark.usefixtures("quick_likelihood")
 def test_unknown_material(run_example):
     """The known material gives a volume as good as any; with nothing known the ratio is within a third of the true one.
 

@@ -111,6 +111,7 @@ def test_phase_retrieval_takes_rows_without_values_for_a_smaller_frame(method, s
         assert torch.equal(found[v, last + 1 :], part[-1:].expand(len(gaps) - int(last) - 1, -1))
 
 
+@pytest.mark.usefixtures("plain_light", "unjudged_runs")
 def test_a_helix_is_reconstructed_in_all_rows_that_it_sees(scene):
     """Beside a planar scan of as many photons; and a volume as tall as one frame lacks most of the cells."""
     grid, errors = Grid.centred((24, 44, 24), PIXEL), {}

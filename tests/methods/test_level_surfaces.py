@@ -24,7 +24,7 @@ from holosplat.scan import Exposures, Scan
 from holosplat.specimens.phantoms import Ball
 from holosplat.specimens.scene import MeshScene
 
-pytestmark = pytest.mark.usefixtures("plain_light")
+pytestmark = pytest.mark.usefixtures("plain_light", "unjudged_runs")
 
 PIXEL, SHAPE = 1e-6, (21, 23)
 WALL, LIQUID, GEL = DeltaBeta(1.2e-6, 3e-9), DeltaBeta(6e-7, 3e-10), DeltaBeta(8e-7, 1e-9)

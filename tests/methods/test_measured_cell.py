@@ -10,6 +10,8 @@ import pytest
 import holosplat as hs
 from holosplat.methods.levels import CONTINUOUS
 
+pytestmark = pytest.mark.usefixtures("unjudged_runs")
+
 ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT.parent / "shared/data/real"
 

@@ -25,6 +25,7 @@ from holosplat.methods import (
     PerView,
     SmoothVolume,
     SurfaceFit,
+    SurfaceOptions,
     Surfaces,
     Task,
     VoxelFit,
@@ -55,7 +56,11 @@ QUICK: dict[str, Method] = {
     "pixelnerf": PixelNerf(ALIGNED),
     "holographic-tv": HolographicVoxels(VOLUME),
     "volume": SmoothVolume(VOLUME, rounds=1, iterations=5),
-    "auto": Auto().with_effort(0.1),
+    "auto": Auto(
+        GAUSSIANS,
+        SurfaceOptions(fit=SurfaceFit(schedule=Schedule(steps=4))),
+        SmoothVolume(VOLUME, rounds=1, iterations=5),
+    ),
 }
 """Every method of one time, with options that take seconds."""
 FITTED = ("gaussians", "surfaces", "voxels", "neural-field", "onix", "pixelnerf")

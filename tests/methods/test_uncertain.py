@@ -31,6 +31,8 @@ from holosplat.methods.uncertain import (
     without_idle,
 )
 
+pytestmark = pytest.mark.usefixtures("unjudged_runs")
+
 RATIO = MaterialPrior.of_ratio(MATERIAL.ratio)
 
 

@@ -27,6 +27,8 @@ from holosplat.workflows.provenance import CONFIG_SUM, RESUMED_WITH, RUN, config
 from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
 from holosplat.workflows.run_folder import RunFolder
 
+pytestmark = pytest.mark.usefixtures("unjudged_runs")
+
 WATER = MaterialPrior.known(parse_material("water").delta_beta(20))
 OTHER = r"must be of a run with the settings in .*config\.json, but it was written with others; bring back the config"
 

@@ -63,6 +63,7 @@ def paths_and_values(method):
     return {path: reduce(getattr, path.split("."), method) for path in paths(method) if not path.endswith("kind")}
 
 
+@pytest.mark.usefixtures("unjudged_runs")
 def test_mistakes_are_found_on_held_out_frames_and_none_where_there_is_none(monkeypatch):
     scan = scan_of(12)
     few = ("other sign of δ", "twice the angles", "matter beyond the field")
@@ -87,6 +88,7 @@ class Long(Again):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("unjudged_runs")
 def test_what_mends_rehearsals_too_is_no_mistake(monkeypatch):
     """A method that is wrong by itself is mended on simulated frames, too, whose metadata are right; half the angles
     are mended on the measured ones alone."""

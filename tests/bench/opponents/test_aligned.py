@@ -30,6 +30,8 @@ from holosplat_bench.training.folder import Dataset
 from holosplat_bench.training.options import FrameLossWeights, Ranges, TrainOptions, ViewSampling
 from holosplat_bench.training.sample import Sample
 
+pytestmark = pytest.mark.usefixtures("unjudged_runs")
+
 SMALL = AlignedNetwork((4, 6), 8, 2)
 OPTIONS = TrainOptions(
     steps=4,

@@ -24,6 +24,8 @@ from ..propagation import angular_spectrum_factor, fresnel_factors, gaussian_fac
 
 SMALL, KEPT = 1 << 20, 8
 """Samples of factors that are kept, at most, and how many: the verdict's views share them, and times of a series."""
+LARGE = 1 << 22
+"""Samples of the latest factors, at most, which are kept beside these: the views of a simulation share them."""
 
 Refraction = Sequence[tuple[float, float]] | np.ndarray | Tensor
 """`(k δ, k β)` of each channel of matter per unit of its line integral: [C, 2] for all views, or [V, C, 2]."""
@@ -174,7 +176,8 @@ def optical_path(
             beyond = angular_spectrum_factor(raster, pitch, lam, z, complex_dtype)
         else:
             pairs, which = torch.unique(torch.stack((lam, z), dim=1), dim=0, return_inverse=True)
-            known = _kept if len(pairs) * math.prod(raster) <= SMALL else _known_factor
+            size = len(pairs) * math.prod(raster)
+            known = _kept if size <= SMALL else _latest if size <= LARGE else _known_factor
             beyond = known(raster, pitch, tuple(map(tuple, pairs.tolist())), complex_dtype).to(on)
     return OpticalPath(rows, columns, *blurs, lam, alike, *frame, pitch, beyond, which)
 
@@ -188,6 +191,7 @@ def _known_factor(
 
 
 _kept = lru_cache(maxsize=KEPT)(_known_factor)
+_latest = lru_cache(maxsize=1)(_known_factor)
 
 
 def _numbers(given: np.ndarray | Tensor, on: torch.device) -> Tensor:

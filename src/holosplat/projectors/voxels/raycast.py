@@ -30,8 +30,8 @@ def _cast(values: Tensor, grid: Grid, views: Views, v: int, step: float) -> Tens
     centre = np.array(grid.origin) + 0.5 * (np.array(grid.shape[::-1]) - 1) * size
     half = 0.5 * np.array(grid.shape[::-1]) * size
     length = step * float(size.min())
-    reach = float(np.linalg.norm(half))
     rotation, shift = views.rotations[v], views.shifts[v]
+    reach = float(np.abs(rotation[2]) @ (half + 0.5 * size))  # samples fade half a voxel beyond the grid
     pixel = float(views.pixel_sizes[v])
     x = (np.arange(w) + 0.5 - w / 2) * pixel + shift[0]
     y = (np.arange(h) + 0.5 - h / 2) * pixel + shift[1]
