@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.special import ndtr, stdtrit
 
 from ..checks import require
 
@@ -198,10 +199,11 @@ def select(
     by the caller; folds: how many there are. Folds are looked at one after another, as long as those before leave the
     candidate open: it may win by them, and has not won early. The frames, and not their blocks, give the standard error
     over several folds: frames differ by more than their parts do. After k of K folds a candidate wins early by √(K/k)
-    times the errors that it needs in the end, as group-sequential trials do (O'Brien & Fleming 1979), whether frames or
-    blocks give them. by: how unseen frames came about; beside: other names that a candidate must win against, too.
-    surely, least: whether a gain must be sure, and the practical size that it must have. Where another score has told
-    that it is sure, its size is enough; where another has told its size (`least` is 0), it need only be sure.
+    times as many errors as in the end (O'Brien & Fleming 1979), and more by Student's t, for few frames do not tell
+    their own scatter; both frames and blocks must say so. by: how unseen frames came about; beside: other names that a
+    candidate must win against, too. surely, least: whether a gain must be sure, and the practical size that it must
+    have. Where another score has told that it is sure, its size is enough; where another has told its size (`least` is
+    0), it need only be sure.
     """
     require(len(candidates) > 0, "a selection needs at least one candidate, but there is none.")
     began, best, compared = time.perf_counter(), candidates[0], list[Compared]()
@@ -240,10 +242,11 @@ def _wins_early(
 ) -> bool:
     """Whether a candidate wins against all rivals by the first folds of several; looked: their number, and of all."""
     first, every = looked
-    strict = math.sqrt(every / first)
     for rival in rivals:
         mine, theirs = (Score.joined([score(name, fold) for fold in range(first)]) for name in (candidate, rival))
-        for gain, error in (mine.gain_over(theirs), mine.by_frames.gain_over(theirs.by_frames)):
-            if not Compared(candidate, gain, strict * error, least).wins:
+        for one, other in ((mine, theirs), (mine.by_frames, theirs.by_frames)):
+            gain, error = one.gain_over(other)
+            few = stdtrit(max(1, len(one.powers) - 1), ndtr(ERRORS)) / ERRORS
+            if not Compared(candidate, gain, few * math.sqrt(every / first) * error, least).wins:
                 return False
     return True

@@ -134,6 +134,11 @@ class Profile:
     def __len__(self) -> int:
         return len(self._scan)
 
+    def begin(self, constants: Constants) -> None:
+        """Begin all further fits with volumes of the δ/β that `constants` have: one that is far off holds fits back."""
+        self._nominal = constants
+        self._begun.clear()
+
     def air(self) -> float:
         """Part of all pixels whose rays pass beside the support."""
         problem = VolumeProblem(self.frames({}), self.options.prior, 1.0, self.options.start.backend)

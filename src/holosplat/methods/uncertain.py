@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -136,7 +136,7 @@ def determine(task: Task, uncertain: Uncertain, options: ProfileOptions | None =
     profile = Profile(task, ratio, middle | {"delta_beta": ratio}, corners, options or ProfileOptions())
     if profile.air() < ENOUGH_AIR:
         return _untold(ranges, middle, "too few pixels show empty space, without which frames cannot tell")
-    return without_idle(profile, Search(profile, ranges, task, start).run())
+    return without_idle(profile, Search(profile, ranges, task, start, profile.begin).run())
 
 
 def without_idle(profile: Profile, found: tuple[Determined, ...]) -> tuple[Determined, ...]:
@@ -237,6 +237,8 @@ class Search:
     ranges: Mapping[str, Range]
     task: Task
     begun: Mapping[str, float] = field(default_factory=dict)
+    away: Callable[[Mapping[str, float]], None] = lambda constants: None
+    """Told where the search goes on, where that is more than a step of δ/β from `begun`; misfits are then new."""
     _values: dict[tuple[float, ...], float] = field(default_factory=dict)
     _planned: int = 1
 
@@ -264,6 +266,10 @@ class Search:
         at, step = self.start.copy(), np.array([2 * h / (places - 1) for h, places in zip(self.half, self.places)])
         for i in range(len(at)):
             at = self._descended(at, i, step[i])
+        ratio = np.array([name == "delta_beta" for name in self.names])
+        if bool((ratio & (np.abs(at - self.start) > 1.5 * step)).any()):
+            self.away(self._constants(at))
+            self._values.clear()
         for _ in range(NEWTON):
             _, hessian = self._slopes(at, step)
             shown = 0.5 * np.diag(hessian) * step**2 > SEEN * self._temperature()
