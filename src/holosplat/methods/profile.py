@@ -67,7 +67,7 @@ class ProfileOptions:
     """Voxels by which the support is wider, for rims."""
     doubt: Share = 0.01
     """Part of the contrast (rms) that counts as noise besides: without any, a fit would not come to its end."""
-    iterations: Natural = 30
+    iterations: Natural = 60
     """Iterations of each of two rounds, whose second takes the level of matter from the first. All δ/β share it."""
     start: HolographicTV = field(
         default_factory=lambda: HolographicTV(
