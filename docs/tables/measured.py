@@ -128,25 +128,27 @@ def cell() -> str:
     return markdown((*head, "processor / s"), lines)
 
 
-NULLS = {"largest": ("1f58925", "9741492"), "usual": ("15fa4ce", "15fa4ce-dirty")}
-"""Commits by δ/β of the null of first volumes; the last was dirty in a file of tests."""
+NULLS = {"largest": ("1f58925", "9741492"), "usual": ("15fa4ce", "15fa4ce-dirty"), "one start": ("72147ec",)}
+"""Commits by δ/β of the null of first volumes, the second of them dirty in a file of tests; and with the usual one as the
+null, where all fits of the likelihood begin with one volume."""
 
 
 @table("nothing-told", "python benchmarks/nothing_told.py --data FOLDER", "half an hour", "nothing_told.csv")
 def nothing_told() -> str:
-    """Scenes of which nothing is told, with the largest and with the usual δ/β as the null."""
+    """Scenes of which nothing is told, with the largest and with the usual δ/β as the null, and with one start."""
     found = {(r["family"], int(r["seed"]), r["commit"]): r for r in read("nothing_told.csv")}
     lines = list[list[str]]()
     for (family, seed, _), row in found.items():
         if row["commit"] not in NULLS["usual"]:
             continue
-        each = [next(found[family, seed, one] for one in n if (family, seed, one) in found) for n in NULLS.values()]
+        each = [next((found[family, seed, k] for k in n if (family, seed, k) in found), None) for n in NULLS.values()]
         true = rounded(row["true"], 0) if row["true"] != "nan" else "two"
-        ratios = (rounded(r["found"], 0) if r["found"] != "nan" else "two" for r in each)
-        errors = (rounded(r["error"], 3) for r in each)
-        lines.append([family, str(seed), row["use"], true, *ratios, *errors, rounded(row["seconds"], 0)])
+        ratios = ("–" if r is None else rounded(r["found"], 0) if r["found"] != "nan" else "two" for r in each)
+        errors = ("–" if r is None else rounded(r["error"], 3) for r in each)
+        seconds = ("–" if r is None else rounded(r["seconds"], 0) for r in each[1:])
+        lines.append([family, str(seed), row["use"], true, *ratios, *errors, *seconds])
     columns = [f"{what}, {one}" for what in ("δ/β", "error") for one in NULLS]
-    head = ("family", "seed", "made on", "true δ/β", *columns, "processor / s")
+    head = ("family", "seed", "made on", "true δ/β", *columns, *(f"processor / s, {one}" for one in list(NULLS)[1:]))
     return markdown(head, sorted(lines, key=lambda one: (one[1] == "106" or one[:2] == ["HL60", "2"], one[2])))
 
 
