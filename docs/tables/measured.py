@@ -129,8 +129,8 @@ def cell() -> str:
 
 
 NULLS = {"largest": ("1f58925", "9741492"), "usual": ("15fa4ce", "15fa4ce-dirty"), "one start": ("72147ec",)}
-"""Commits by δ/β of the null of first volumes, the second of them dirty in a file of tests; and with the usual one as the
-null, where all fits of the likelihood begin with one volume."""
+"""Commits by δ/β of the null of first volumes, the second dirty in a file of tests; and with the usual one as the null,
+where all fits of the likelihood begin with one volume."""
 
 
 @table("nothing-told", "python benchmarks/nothing_told.py --data FOLDER", "half an hour", "nothing_told.csv")
