@@ -136,6 +136,34 @@ def test_a_search_is_as_fine_as_its_systematic_error_and_no_finer(noise_share, m
     assert len(asked) <= most
 
 
+@pytest.mark.parametrize(("begun", "anew"), [(6000.0, True), (900.0, False)])
+def test_a_search_that_goes_far_from_where_it_began_begins_anew(begun, anew):
+    def valley(constants):
+        return 2000 * math.log(constants["delta_beta"] / 700.0) ** 2
+
+    valley.noise_share, told = 0.0, []
+    task = Task(blob_scan(count=2), MaterialPrior.unknown())
+    (found,) = Search(valley, {"delta_beta": (60.0, 20_000.0)}, task, {"delta_beta": begun}, told.append).run()
+    assert found.value == pytest.approx(700, rel=0.02)
+    assert len(told) == anew
+    assert all(400 < each["delta_beta"] < 1200 for each in told)
+
+
+def test_fits_of_all_ratios_begin_with_one_volume_and_those_of_each_distance_with_its_own(scan, monkeypatch):
+    at = {"distance": DISTANCE, "delta_beta": MATERIAL.ratio}
+    profile, began = Profile(Task(scan, RATIO), MATERIAL.ratio, at, [at], replace(QUICK, iterations=1)), []
+    volume = profile._volume
+    monkeypatch.setattr(profile, "_volume", lambda frames: began.append(frames.material.ratio) or volume(frames))
+    for ratio in (1.0, 0.5, 2.0):
+        profile(at | {"delta_beta": ratio * MATERIAL.ratio})
+    assert began == pytest.approx([MATERIAL.ratio])
+    profile(at | {"distance": 1.2 * DISTANCE})
+    assert len(began) == 2
+    profile.begin(at | {"delta_beta": 3 * MATERIAL.ratio})
+    profile(at)
+    assert began[2:] == pytest.approx([3 * MATERIAL.ratio])
+
+
 def test_two_constants_that_frames_tell_only_together_are_said_to_be():
     distance, ratio = searched(0.0)
     assert not distance.told
