@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from helpers.cli import holosplat, worked
+from helpers.short import FLOW
 from holosplat.cli import forecast as forecasting
 from holosplat.cli import scans
 from holosplat.cli import track as motion
@@ -17,8 +18,6 @@ from holosplat.io.nxtomo import read_scan
 from holosplat.io.reading import Reading
 from holosplat.io.volumes import read_volume
 from holosplat.matter import DeltaBeta, MaterialPrior
-from holosplat.methods import SmoothVolume
-from holosplat.motion.flow_reconstruction import FlowOptions
 from holosplat.optics.background import LightOptions
 from holosplat.representations import MovingGaussians
 from holosplat.tables import read_rows
@@ -29,23 +28,13 @@ from holosplat_bench.opponents.fields import SpaceTimeField
 
 pytestmark = pytest.mark.usefixtures("unjudged_runs")
 
-QUICK = FlowOptions(
-    volume=SmoothVolume(coarser=(), rounds=1, iterations=4),
-    cells=2,
-    most_degree=0,
-    most_cells=2,
-    steps=2,
-    iterations=3,
-    final=3,
-)
-
 
 @pytest.fixture
 def quick(monkeypatch, tmp_path):
     """A series of three times, fitted in few steps, without the report's drawing."""
 
     def few(scan, prior, options, *rest, **others):
-        return reconstruct_moving(scan, prior, replace(QUICK, fading=options.fading), *rest, ask=False, **others)
+        return reconstruct_moving(scan, prior, replace(FLOW, fading=options.fading), *rest, ask=False, **others)
 
     monkeypatch.setattr(motion, "reconstruct_moving", few)
 
@@ -132,7 +121,7 @@ def test_two_materials_in_motion_are_refused_or_said_to_be_left(quick, capsys):
     assert refused.code == 2
     assert "bodies are of one material, but several are known; give --material once." in refused.err
     prior = MaterialPrior.known(DeltaBeta(8e-7, 8e-10), DeltaBeta(4e-7, 3e-10))
-    how = (0, LightOptions(), QUICK)
+    how = (0, LightOptions(), FLOW)
     assert not motion.reconstruct_in_motion(quick / "s.nxs", Reading(), prior, RunFolder(quick / "none"), how)
     said = capsys.readouterr().err
     assert "a flow carries one material, but several are known" in said

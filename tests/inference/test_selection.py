@@ -128,6 +128,22 @@ def test_few_frames_do_not_tell_their_own_scatter():
     assert select("name", ["null", "other"], score, 3, by="views set aside").choice == "null"
 
 
+@pytest.mark.parametrize("against", ["null", "rival"])
+def test_blocks_and_rivals_must_speak_for_an_early_end_too(against):
+    """Two frames of the same mean, whose blocks differ: the second fold is looked at. So it is where the null is beaten
+    evenly, and another name that must be, not."""
+    asked, uneven = set(), torch.tensor([0.3, 0.9]).repeat_interleave(32)[None, None, :]
+
+    def score(name, fold):
+        asked.add(fold)
+        whole = noise((1, 64, 64), fold).expand(2, -1, -1)
+        other, rival = (uneven, 1.0) if against == "null" else (0.4, 0.3 + 0.3 * uneven)
+        return Score.of({"null": 1.0, "other": other, "rival": rival}[name] * whole)
+
+    select("name", ["null", "other"], score, 3, by="views", beside={"other": ["rival"]})
+    assert asked > {0}
+
+
 def test_what_one_fold_leaves_open_all_of_them_decide():
     """Two frames of which one alone is halved tell nothing; eight, seven of which are halved, do."""
     uneven = torch.tensor([0.5, 1.05])[:, None, None]

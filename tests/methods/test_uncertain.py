@@ -138,10 +138,14 @@ def test_a_search_is_as_fine_as_its_systematic_error_and_no_finer(noise_share, m
 
 @pytest.mark.parametrize(("begun", "anew"), [(6000.0, True), (900.0, False)])
 def test_a_search_that_goes_far_from_where_it_began_begins_anew(begun, anew):
-    def valley(constants):
-        return 2000 * math.log(constants["delta_beta"] / 700.0) ** 2
+    told = []
 
-    valley.noise_share, told = 0.0, []
+    def valley(constants):
+        """Where fits begin far off, misfits are others, and the least is not quite there."""
+        least, more = (900.0, 50.0) if anew and not told else (700.0, 0.0)
+        return 2000 * math.log(constants["delta_beta"] / least) ** 2 - more
+
+    valley.noise_share = 0.0
     task = Task(blob_scan(count=2), MaterialPrior.unknown())
     (found,) = Search(valley, {"delta_beta": (60.0, 20_000.0)}, task, {"delta_beta": begun}, told.append).run()
     assert found.value == pytest.approx(700, rel=0.02)
@@ -294,14 +298,17 @@ def test_one_energy_holds_unless_frames_are_predicted_better_with_a_bandwidth(ga
     assert kept or "0 is used" in width.line()
 
 
-def test_frames_set_aside_are_predicted_by_a_volume_of_the_others(scan):
-    """Without a blur, as they are, better than with one of four pixels."""
+def test_frames_set_aside_are_predicted_by_a_volume_of_the_others(scan, monkeypatch):
+    """Without a blur, as they are, better than with one of four pixels; nothing begins with a volume of all frames."""
     at = {"distance": DISTANCE, "delta_beta": MATERIAL.ratio}
     profile = Profile(Task(scan, RATIO), MATERIAL.ratio, at, [at], replace(QUICK, iterations=3))
-    unseen = np.array([False, False, True, False, False])
+    unseen, began, volume = np.array([False, False, True, False, False]), [], Profile._volume
+    profile(at)
+    monkeypatch.setattr(Profile, "_volume", lambda self, of: began.append(len(of.train)) or volume(self, of))
     true, wrong = profile.score(at, unseen), profile.score(at | {"psf_sigma_px": 4.0}, unseen)
     assert true.frames == 1
     assert true.gain_over(wrong)[0] > 0
+    assert began == [4, 4]
 
 
 def test_widths_of_light_and_detector_are_those_of_the_exposures(scan):
