@@ -142,7 +142,7 @@ def test_a_search_that_goes_far_from_where_it_began_begins_anew(begun, anew):
 
     def valley(constants):
         """Where fits begin far off, misfits are others, and the least is not quite there."""
-        least, more = (900.0, 50.0) if anew and not told else (700.0, 0.0)
+        least, more = (900.0, 1e4) if anew and not told else (700.0, 0.0)
         return 2000 * math.log(constants["delta_beta"] / least) ** 2 - more
 
     valley.noise_share = 0.0
