@@ -142,8 +142,8 @@ def test_a_search_that_goes_far_from_where_it_began_begins_anew(begun, anew):
 
     def valley(constants):
         """Where fits begin far off, misfits are others, and the least is not quite there."""
-        least, more = (900.0, 1e4) if anew and not told else (700.0, 0.0)
-        return 2000 * math.log(constants["delta_beta"] / least) ** 2 - more
+        least, more = (700.0, 1e4) if told else (900.0, 0.0) if anew else (700.0, 0.0)
+        return 2000 * math.log(constants["delta_beta"] / least) ** 2 + more
 
     valley.noise_share = 0.0
     task = Task(blob_scan(count=2), MaterialPrior.unknown())
