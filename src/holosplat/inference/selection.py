@@ -10,7 +10,6 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.special import ndtr, stdtrit
 
 from ..checks import require
 
@@ -241,6 +240,8 @@ def _wins_early(
     candidate: str, rivals: Sequence[str], score: Callable[[str, int], Score], looked: tuple[int, int], least: float
 ) -> bool:
     """Whether a candidate wins against all rivals by the first folds of several; looked: their number, and of all."""
+    from scipy.special import ndtr, stdtrit
+
     first, every = looked
     for rival in rivals:
         mine, theirs = (Score.joined([score(name, fold) for fold in range(first)]) for name in (candidate, rival))
