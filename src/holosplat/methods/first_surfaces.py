@@ -27,7 +27,7 @@ from .coarse import CoarseToFine, Way, settled, unexplained
 from .gaussian_options import GaussianOptions
 from .keeper import BY
 from .method import Task
-from .surface_fit import SurfaceOptions, cut_surfaces, extract_surfaces, frames_of
+from .surface_fit import Extraction, SurfaceOptions, cut_surfaces, extract_surfaces, frames_of
 from .volume import SmoothStage, SmoothVolume, material_of_levels
 
 
@@ -54,7 +54,8 @@ def first_surfaces(
 
     def of_gaussians(before: SurfaceMesh | None) -> SurfaceMesh | None:
         cloud = fitted(task)
-        return extract_surfaces(cloud, task.scan, surfaces.extraction) if cloud.matter.single else None
+        cut = partial(extract_surfaces, cloud, task.scan)
+        return cut_as_seen(task, cut, surfaces) if cloud.matter.single else None
 
     if is_noisy(task, options):
         return (_if_any(of_gaussians), *surfaces_of_volume(task, options, surfaces))
@@ -68,7 +69,7 @@ def surfaces_of_volume(task: Task, options: GaussianOptions, surfaces: SurfaceOp
         matter = material_of_levels(task, options.volume.backend, options.estimate)
         rounds = replace(options.volume.in_noise(), refine=1)
         volume, grid = holographic_tv(task.scan, matter, rounds, task.on_progress, task.unlike_null)
-        cut = cut_as_seen(task, volume, grid, Matter.one(*matter), surfaces)
+        cut = cut_as_seen(task, _cutter(task, volume, grid, Matter.one(*matter)), surfaces)
         how = options.coarse.of_views(len(task.scan.train()))
         return in_turns(task, settled(task, cut, surfaces, how), options, surfaces)
 
@@ -157,7 +158,7 @@ def _of_levels(
 ) -> SurfaceMesh:
     """Surfaces of `matter`, cut out of a `volume` and settled."""
     occupancy = volume.values[0].cpu() * (volume.matter.delta / matter.delta)
-    cut = cut_as_seen(task, occupancy, volume.grid, matter, surfaces)
+    cut = cut_as_seen(task, _cutter(task, occupancy, volume.grid, matter), surfaces)
     how = options.coarse.of_views(len(task.scan.train()))
     return settled(task, cut, surfaces, how)
 
@@ -201,21 +202,30 @@ def _cut_again(task: Task, found: SurfaceMesh, options: GaussianOptions, surface
         scan = at_one_ratio(scan, Shares(shares.float().cpu(), grid, found.matter.channels), first.ratio, backend)
     how = options.volume.in_noise()
     volume, grid = agreed(scan, first, torch.as_tensor(start).float(), how, task.on_progress, task.unlike_null)
-    return cut_as_seen(task, volume, grid, found.matter, surfaces)
+    return cut_as_seen(task, _cutter(task, volume, grid, found.matter), surfaces)
 
 
-def cut_as_seen(task: Task, volume: Tensor, grid: Grid, matter: Matter, surfaces: SurfaceOptions) -> SurfaceMesh:
-    """The surfaces of an occupancy [Z, Y, X] on `grid` at the one of `LEVELS` at which they leave least of the frames.
+Cut = Callable[[Extraction], SurfaceMesh]
+"""Gets surfaces out of Gaussians or a volume."""
+
+
+def _cutter(task: Task, volume: Tensor, grid: Grid, matter: Matter) -> Cut:
+    """What cuts surfaces out of an occupancy [Z, Y, X] on `grid`."""
+    return partial(cut_surfaces, volume, grid, task.scan.views.finest, matter)
+
+
+def cut_as_seen(task: Task, cut: Cut, surfaces: SurfaceOptions) -> SurfaceMesh:
+    """The surfaces that `cut` gets at the one of `LEVELS` at which they leave least of the frames; another level that
+    the options ask for scales them.
 
     Noise and total variation make what is thin fainter, and a surface that is too large shrinks, but one that is
     missing does not grow. Errors: `InputError` if there are none at any level.
     """
-    tried = list[tuple[float, SurfaceMesh]]()
+    how, tried = surfaces.extraction, list[tuple[float, SurfaceMesh]]()
     for level in LEVELS:
-        how = replace(surfaces.extraction, level=level)
         with suppress(InputError):  # no surface at this level
-            cut = cut_surfaces(volume, grid, task.scan.views.finest, matter, how)
-            tried.append((_left(task, cut, surfaces), cut))
+            found = cut(replace(how, level=min(level * how.level / Extraction.level, 0.99)))
+            tried.append((_left(task, found, surfaces), found))
     require(len(tried) > 0, "the volume holds no surface.")
     return min(tried, key=lambda one: one[0])[1]
 

@@ -17,16 +17,13 @@ from ..representations import GaussianCloud, Stored, SurfaceMesh
 from ..scan import Scan
 from .coarse import CoarseToFine, Way, begun_surfaces, coarse_surfaces, in_steps, missing_matter, on_pixels, settled
 from .cross_validation import BY_FISSION, MANY, Folds
-from .first_surfaces import first_surfaces, is_noisy, surfaces_of_volume, with_missing_bodies
+from .first_surfaces import Cut, cut_as_seen, first_surfaces, is_noisy, surfaces_of_volume, with_missing_bodies
 from .gaussians import Gaussians, GaussianStage
 from .keeper import BY
 from .method import Method, Near, Stage, Task, quiet, run_quietly
-from .surface_fit import Extraction, SurfaceOptions, extract_surfaces, frames_of, surface_fit
+from .surface_fit import SurfaceOptions, extract_surfaces, frames_of, surface_fit
 
 STAGE = "surfaces"
-
-Cut = Callable[[Extraction], SurfaceMesh]
-"""Gets surfaces out of Gaussians."""
 
 
 @dataclass(frozen=True)
@@ -102,28 +99,31 @@ class BodiesStage(GaussianStage):
         frames those of a first volume, where there are any, and, where much matter is missing from the first after some
         steps, those cut on finer voxels. Of small frames bodies that are missing join them (`_with_missing_bodies`).
 
-        Marching cubes at one half leave out what is not much thicker than their voxels, and surfaces that are missing
-        do not grow. Errors: those of `cut`, where there are no others.
+        Marching cubes leave out what is not much thicker than their voxels, and surfaces that are missing do not grow.
+        Errors: those of `cut`, where there are no others.
         """
         if not task.bounded or task.freedom is not None:
             return cut(self.surfaces.extraction)
         how, seen, found = self.options.coarse, self._without_validation(task), dict[str, SurfaceMesh]()
         steps, most = how.of_views(len(seen.scan.train())), how.missing_matter
-        other = self._of_first_volume(task, cloud) if self._small(task) and self._straight(task) else None
-        found |= {} if other is None else {"of a volume": other}
+        straight = self._small(task) and self._straight(task)
         try:
-            first = cut(self.surfaces.extraction)
+            first = cut_as_seen(seen, cut, self.surfaces)
         except InputError:  # Gaussians hold no surface
-            if not found:
+            other = self._of_first_volume(task, None) if straight else None
+            if other is None:
                 raise
-            return found["of a volume"]
+            return other
+        other = self._of_first_volume(task, cloud) if straight else None
+        found |= {} if other is None else {"of a volume": other}
         lacking, small = bool(found) or self._missing(first, task) > most, self._small(task) and how.join_missing
         if not (lacking or small):
             return first
         own = settled(seen, first, self.surfaces, steps)
         if lacking:
             if self._missing(own, task) > most:
-                found["on finer voxels"] = settled(seen, cut(self.surfaces.extraction.finer()), self.surfaces, steps)
+                finer = replace(self.surfaces, extraction=self.surfaces.extraction.finer())
+                found["on finer voxels"] = settled(seen, cut_as_seen(seen, cut, finer), self.surfaces, steps)
             chosen = self._chosen("surfaces", {"of Gaussians": own, **found}, seen)
             if chosen is not own or "of a volume" in found:
                 first = own = chosen
@@ -168,15 +168,17 @@ class BodiesStage(GaussianStage):
         task.on_start(decision, None)
         return more if decision.choice == MORE else None
 
-    def _of_first_volume(self, task: Task, cloud: GaussianCloud) -> SurfaceMesh | None:
-        """Surfaces without which Gaussians began, as they explain the frames badly; in noise, where Gaussians do, those
-        that have taken turns with a volume."""
+    def _of_first_volume(self, task: Task, cloud: GaussianCloud | None) -> SurfaceMesh | None:
+        """Surfaces without which Gaussians began, as they explain the frames badly; or, where there are none and
+        Gaussians lack much matter or hold no surface (`cloud` is None), those that have taken turns with a volume, of
+        thin bodies, too."""
         how = self.options.coarse
         if not is_noisy(task, self.options):
             if not (self.poor and self.poor[0][0] is task.scan):  # of a run that was resumed
                 self.near_surfaces(task, self.surfaces)
-            return self.poor[0][1]
-        if self._missing(cloud, task) <= how.missing_matter:
+            if self.poor[0][1] is not None:
+                return self.poor[0][1]
+        if cloud and self._missing(cloud, task) <= how.missing_matter:
             return None
         seen = self._without_validation(task)
         return begun_surfaces(seen, lambda at: surfaces_of_volume(at, self.options, self.surfaces), self.surfaces, how)
