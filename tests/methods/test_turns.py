@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -73,15 +74,17 @@ def test_frames_choose_the_level_of_a_volume(share, wrong, noisy):
     """Half of the matter's level is none where the volume is too faint, or too dense."""
     blurred = avg_pool3d(torch.as_tensor(occupancy(mesh_of()))[None, None], 3, 1, 1)[0, 0].float() * share
     grid = Grid.of_views(noisy.scan.views)
-    chosen = cut_as_seen(noisy, blurred, grid, mesh_of().matter, HOW)
-    other = cut_surfaces(blurred, grid, PITCH, mesh_of().matter, replace(HOW.extraction, level=wrong))
+    cut = partial(cut_surfaces, blurred, grid, PITCH, mesh_of().matter)
+    chosen = cut_as_seen(noisy, cut, HOW)
+    other = cut(replace(HOW.extraction, level=wrong))
     assert error(chosen) < 0.9 * error(other)
 
 
 def test_a_volume_below_all_levels_has_no_surface(noisy):
     grid = Grid.of_views(noisy.scan.views)
+    cut = partial(cut_surfaces, torch.full(grid.shape, 0.1), grid, PITCH, mesh_of().matter)
     with pytest.raises(InputError, match="no surface"):
-        cut_as_seen(noisy, torch.full(grid.shape, 0.1), grid, mesh_of().matter, HOW)
+        cut_as_seen(noisy, cut, HOW)
 
 
 # --- when turns end -----------------------------------------------------------------------------------------
