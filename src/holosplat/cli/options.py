@@ -286,8 +286,10 @@ class MethodOptions:
                 f"{method.kind}; leave --start.",
             )
             if self.start == "random" and self.preset is None and self.config is None:
-                alone, settings = isinstance(method, Gaussians), preset("random")  # others move it too little
-                method = overridden(settings if alone else replace(method, gaussians=settings), self.changes)
+                settings: Method = preset("random")  # others move it too little
+                if isinstance(method, Auto | Surfaces):
+                    settings = replace(method, gaussians=settings)
+                method = overridden(settings, self.changes)
             else:
                 where = "start" if isinstance(method, Gaussians) else "gaussians.start"
                 method = overridden(method, (*self.changes, f"{where}={self.start}"))
