@@ -261,6 +261,27 @@ class Wall(Unmoved):
 
     def voxelise(self, grid: Grid) -> Volume:
         """δ and β, by the share of each voxel that lies in the wall and in the hollow."""
+        total = np.zeros((2, grid.shape[0], 1, grid.shape[2]))
+        for section, added in self._parts:
+            total += added[:, None, None, None] * self._share(section, grid)
+        delta, beta = (np.broadcast_to(part, grid.shape) for part in total)
+        return Volume(delta, beta, grid)
+
+    def content(self, volume: Volume) -> Volume:
+        """What a `volume` has in the hollow, against the filling; zero in voxels that the wall touches, and beyond.
+
+        A volume of all that is in the beam is nearer to the filling there than to nothing; any other is taken to be
+        against the filling already.
+        """
+        grid = volume.grid
+        wide, deep = self.inner[0] - grid.voxel_size[0], self.inner[1] - grid.voxel_size[2]
+        hollow, known = self._share((wide, deep), grid) == 1, self.voxelise(grid)
+        whole = volume.delta * hollow, volume.beta * hollow
+        beside = whole[0] - known.delta * hollow, whole[1] - known.beta * hollow
+        return Volume(*(beside if np.linalg.norm(beside[0]) < np.linalg.norm(whole[0]) else whole), grid)
+
+    def _share(self, section: Section, grid: Grid) -> np.ndarray:
+        """Share [Z, 1, X] of each voxel that lies in a section."""
         x, _, z = grid.axes()
         steps = (np.arange(FINER) + 0.5) / FINER - 0.5
         fine = [
@@ -270,10 +291,6 @@ class Wall(Unmoved):
         px, pz = fine[0][None] - self.centre[0], fine[1][:, None] - self.centre[1]
         cos, sin = np.cos(self.turn), np.sin(self.turn)
         u, v = px * cos - pz * sin, px * sin + pz * cos
-        total = np.zeros((2, len(z), len(x)))
-        for (wide, deep), added in self._parts:
-            within = u**2 + v**2 <= (0.5 * wide) ** 2 if self.round else (abs(u) <= 0.5 * wide) & (abs(v) <= 0.5 * deep)
-            share = within.reshape(len(z), FINER, len(x), FINER).mean(axis=(1, 3))
-            total += added[:, None, None] * share
-        delta, beta = (np.broadcast_to(part[:, None], grid.shape) for part in total)
-        return Volume(delta, beta, grid)
+        wide, deep = section
+        within = u**2 + v**2 <= (0.5 * wide) ** 2 if self.round else (abs(u) <= 0.5 * wide) & (abs(v) <= 0.5 * deep)
+        return within.reshape(len(z), FINER, len(x), FINER).mean(axis=(1, 3))[:, None]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 import tyro
@@ -39,6 +40,16 @@ def test_single_fields_are_set_one_after_another():
     assert chosen("--preset", "fast", "--set", "steps=7") == overridden(preset("fast"), ["fit.schedule.steps=7"])
     assert chosen("--set", "steps=7", "--set", "steps=8", "--method", "gaussians").fit.schedule.steps == 8
     assert chosen("--method", "paganin-tv", "--set", "retrieval=ctf") == METHODS["ctf-tv"]
+
+
+def test_a_random_start_has_the_settings_of_its_preset_unless_others_are_named():
+    at_random = preset("random")
+    assert chosen("--start", "random", "--method", "gaussians") == at_random
+    assert chosen("--start", "random", "--set", "gaussians.fit.steps=7") == Auto(
+        gaussians=overridden(at_random, ["fit.steps=7"])
+    )
+    assert chosen("--start", "random", "--preset", "fast") == replace(preset("fast"), start="random")
+    assert chosen("--start", "learned") == Auto(gaussians=replace(Gaussians(), start="learned"))
 
 
 def test_a_file_and_a_change_of_it(tmp_path):

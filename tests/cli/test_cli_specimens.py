@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import tifffile
 
 from helpers.cli import Outcome, holosplat, worked
+from holosplat.checks import InputError
+from holosplat.cli.options import PriorOptions
 from holosplat.geometry import Grid
 from holosplat.io.nxtomo import read_scan
 from holosplat.io.volumes import read_volume
@@ -91,6 +94,20 @@ def test_light_is_in_the_frames_and_in_the_file(tmp_path):
     scan = read_scan(out)
     assert scan.provenance["light_grain"] == "0.004"
     assert 0.005 < scan.frames[:, 0].std() < 0.05
+
+
+def test_vacuum_replaces_the_medium_that_is_usual_for_a_kind(tmp_path):
+    scan, truth = tmp_path / "s.nxs", tmp_path / "t.h5"
+    drops = ["--specimen", "bubbles", "--material", "water", "--medium", "vacuum"]
+    ran("simulate", *drops, *FIELD, "--out", scan, "--truth", truth)
+    assert read_scan(scan).provenance["medium"] == "vacuum"
+    water = parse_material("water").delta_beta(20.0)
+    assert read_volume(truth).delta.max() == pytest.approx(water.delta, rel=1e-6)
+    told = PriorOptions(material=("water",), medium="vacuum")
+    assert told.prior(20.0, "tube:4e-5:5e-5:glass:vacuum") == PriorOptions(material=("water",)).prior(20.0)
+    assert told.prior(20.0).against == ""
+    with pytest.raises(InputError, match="--medium-density needs a --medium other than vacuum"):
+        replace(told, medium_density=1.0).prior(20.0)
 
 
 @pytest.mark.parametrize(

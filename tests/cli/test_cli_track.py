@@ -22,7 +22,7 @@ from holosplat.io.volumes import read_volume, write_voxels
 from holosplat.io.vtk import read_meshes
 from holosplat.representations import MovingSurfaces
 
-KNOWN = ("--material", "haemoglobin")
+KNOWN = ("--material", "haemoglobin", "--medium", "air")
 
 
 def worked_by(*arguments: object) -> Outcome:
@@ -39,6 +39,7 @@ def folder(tmp_path_factory) -> Path:
     with undrawn():
         said = worked_by("track", folder / "scan.nxs", *how, "--out", folder / "run")
     assert "start: bodies at single times: tomography (frames of one time: network's guess -" in said.out
+    assert "against air: δ and β are differences" in said.out
     return folder
 
 

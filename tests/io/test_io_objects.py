@@ -157,6 +157,16 @@ def test_a_field_of_any_encoding_comes_back(encoding, tmp_path):
     assert found.network == field.network
 
 
+def test_a_field_of_matter_on_both_sides_comes_back(tmp_path):
+    network = Network(Encoding(levels=2, features=2, log2_size=6), hidden=5, layers=1)
+    field = NeuralField(GRID, CELL, network, torch.ones(GRID.shape), upper=0.0, lower=-math.inf)
+    write_object(tmp_path / "field.h5", field)
+    found = read_object(tmp_path / "field.h5")
+    assert isinstance(found, NeuralField)
+    assert found.lower == -math.inf
+    assert_same_state(found.state(), field.state())
+
+
 def test_gradients_do_not_enter_a_file(tmp_path):
     """An object in the middle of a fit can be written, too."""
     values = torch.rand(1, *GRID.shape, requires_grad=True)

@@ -12,7 +12,7 @@ import torch
 from holosplat.baselines.material import estimate_delta, level_of
 from holosplat.baselines.tomography import plateau
 from holosplat.beamline.simulate import simulate
-from holosplat.checks import InputError
+from holosplat.checks import NoMatterError
 from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta, MaterialPrior, Matter
 from holosplat.methods import SmoothVolume, Task
@@ -73,7 +73,7 @@ def test_the_level_is_that_of_the_denser_class():
     assert level_of(volume) == 1
     assert plateau(volume) == pytest.approx(0.05)
     assert level_of(volume[:, torch.randperm(409)]) == 1
-    with pytest.raises(InputError, match="empty volume has no level"):
+    with pytest.raises(NoMatterError):
         level_of(torch.zeros(3, 4, 5))
 
 

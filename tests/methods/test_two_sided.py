@@ -10,6 +10,7 @@ import torch
 
 import holosplat as hs
 from holosplat.baselines import HolographicTV, holographic_tv
+from holosplat.baselines.material import estimate_delta
 from holosplat.checks import InputError
 from holosplat.cli.options import PriorOptions
 from holosplat.geometry import Grid, Views
@@ -138,6 +139,13 @@ def test_every_method_of_continuous_matter_finds_both_sides(name, most, scan, pa
     assert np.linalg.norm(delta - truth.delta) < most * np.linalg.norm(truth.delta)
     assert delta.min() < 0.8 * truth.delta.min()
     assert delta.max() > 0.8 * truth.delta.max()
+
+
+def test_noise_on_both_sides_is_not_taken_for_the_level_of_a_small_hole(pair):
+    """All over the field it has more mass."""
+    noisy = of(ContinuousScene(pair.elements[1:]), 3000)
+    found = estimate_delta(noisy, WATER.ratio, lambda stage, share: None, two_sided=True)
+    assert 0.4 * WATER.delta < found < 1.2 * WATER.delta
 
 
 def test_gaussians_are_of_the_sides_that_a_start_finds(pair):

@@ -17,7 +17,7 @@ from holosplat.materials import wall_of
 from holosplat.model import measure
 from holosplat.optics.retrieval import RETRIEVALS, tikhonov
 from holosplat.optics.sampling import fringe_sampling
-from holosplat.volume import Wall, mean_wave
+from holosplat.volume import Volume, Wall, mean_wave
 from holosplat_bench.specimens.shapes import box_mesh, meshed
 
 PIXEL, SHAPE = 1e-6, (5, 45)
@@ -87,6 +87,21 @@ def test_voxels_hold_the_wall_and_the_filling(wall):
     assert volume.delta.max() == pytest.approx(GLASS.delta)
     D = wall.project(Views.from_angles([0.0], (3, 33), PIXEL))[1][0, 1]
     np.testing.assert_allclose(volume.delta[:, 1].sum(axis=0) * PIXEL, D, rtol=0, atol=0.03 * float(D.max()))
+
+
+@pytest.mark.parametrize("wall", walls())
+def test_the_content_of_a_truth_is_what_its_hollow_has_beside_the_filling(wall):
+    """Whether the truth has the wall or not; nothing is left of the wall alone, or of what the wall touches."""
+    grid = Grid((45, 5, 45), (PIXEL,) * 3, (-22e-6, -2e-6, -22e-6))
+    gas = -np.ones(grid.shape) * (np.indices(grid.shape)[2] == 24) * (np.indices(grid.shape)[0] < 28)
+    known, bubble = wall.voxelise(grid), Volume(WATER.delta * gas, WATER.beta * gas, grid)
+    inside = wall.content(bubble)
+    assert inside.delta.min() == pytest.approx(-WATER.delta)
+    assert not (inside.delta * (np.abs(known.delta - known.delta[22, 2, 22]) > 1e-12)).any()
+    whole = wall.content(Volume(known.delta + bubble.delta, known.beta + bubble.beta, grid))
+    np.testing.assert_allclose(whole.delta, inside.delta, atol=1e-12)
+    np.testing.assert_allclose(whole.beta, inside.beta, atol=1e-15)
+    assert np.abs(wall.content(known).delta).max() < 1e-12
 
 
 def test_the_mean_wave_of_half_a_pixel_of_phase():

@@ -262,6 +262,11 @@ def test_matter_that_goes_on_beyond_the_frames_is_named():
     found = judge(Prediction(kept, cut.exposures, 2), cut)
     assert not found.good
     assert "matter goes on above or below" in found.reasons[0]
+    narrow = whole.cropped(slice(0, 25), slice(10, 22))
+    aside = VoxelGrid(truth.values[:, 10:22, :, 10:22], Grid.of_views(narrow.views), truth.matter)
+    beside = judge(Prediction(aside, narrow.exposures, 2), narrow)
+    assert not beside.good
+    assert "matter goes on at the sides" in beside.reasons[0]
     wrong = on(whole, soft(0.6))  # as wrong, of whole bodies
     assert not wrong.good
     assert "goes on" not in wrong.reasons[0]

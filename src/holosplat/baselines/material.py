@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from ..backends import Backend, resolve
-from ..checks import require
+from ..checks import NoMatterError
 from ..geometry import Grid
 from ..memory import memory_kept
 from ..optics.retrieval import paganin
@@ -51,11 +51,13 @@ def estimate_delta(
     sign: float = 1.0,
     two_sided: bool = False,
 ) -> float:
-    """δ, of that `sign`, of the one material in `scan` with δ/β = `ratio`: the plateau of a non-negative tomography, or
-    of one that may have matter on both sides of its medium."""
+    """δ, of that `sign`, of the one material in `scan` with δ/β = `ratio`: the plateau of a non-negative tomography; or
+    the level of one that may have matter on both sides of its medium, where noise leaves a haze of either sign all over
+    the field, with more mass than the matter."""
     on_progress("estimate of delta", 0.0)
     coarse = scan.coarsened(max(1, round(scan.views.shape[1] / options.width)))
-    return plateau(_trial_volume(coarse, ratio, backend, options, sign, two_sided).abs()) * sign * TRIAL_DELTA
+    trial = _trial_volume(coarse, ratio, backend, options, sign, two_sided)
+    return (level_of(trial.abs()) if two_sided else plateau(trial)) * sign * TRIAL_DELTA
 
 
 def level_of(occupancy: Tensor) -> float:
@@ -65,7 +67,8 @@ def level_of(occupancy: Tensor) -> float:
     bodies in a large field, haze may have more mass.
     """
     values = occupancy.double().flatten().sort(descending=True).values
-    require(bool(values[0] > 0), "an empty volume has no level; look at its frames first.")
+    if not values[0] > 0:
+        raise NoMatterError
     count = torch.arange(1, len(values), dtype=values.dtype, device=values.device)
     upper = values.cumsum(0)[:-1]
     between = (upper * len(values) - values.sum() * count).square() / (count * (len(values) - count))

@@ -72,7 +72,7 @@ class OneMaterial:
     density: Grams | None = None
     """Its density [g/cm³]; a named one has its own."""
     medium: str | None = None
-    """Formula or name of what surrounds it; none means vacuum."""
+    """Formula or name of what surrounds it (default: vacuum)."""
     medium_density: Grams | None = None
     """The medium's density [g/cm³]."""
 
@@ -98,13 +98,15 @@ class MaterialOptions(OneMaterial):
             )
             return Filling(Transparent(1 - self.index / (1.0 if medium_index is None else medium_index)))
 
-        require(self.medium is not None or self.medium_density is None, "--medium-density needs --medium.")
+        around = None if self.medium == "vacuum" else self.medium
+        stray = around is None and self.medium_density is not None
+        require(not stray, "--medium-density needs a --medium other than vacuum.")
         table = read_material_table(self.materials) if self.materials else {}
         named = self.material if self.material is not None or table else "haemoglobin"
         require(named is not None or self.density is None, "--density needs --material.")
         return Filling(
             parse_material(named, self.density) if named is not None else None,
-            parse_material(self.medium, self.medium_density) if self.medium is not None else None,
+            parse_material(around, self.medium_density) if around is not None else None,
             table,
         )
 
@@ -186,7 +188,7 @@ class NoiseOptions:
     """Photon noise."""
 
     photons_per_pixel: Photons | None = None
-    """Mean photons a pixel for Poisson noise; none means noise-free."""
+    """Mean photons a pixel for Poisson noise (default: no noise)."""
     seed: Seed = 0
     """Seed of the noise."""
 
@@ -259,7 +261,7 @@ class MethodOptions:
     """Change one option, such as fit.schedule.steps=500 or fit.steps=500; may be given again and again."""
     start: Literal["phase", "learned", "random"] | None = None
     """Start of Gaussians: phase retrieval with tomography; a trained network, where that explains the frames clearly
-    better; or random (default: as the options say, phase)."""
+    better; or random, with the settings of that preset (default: as the options say, phase)."""
     backend: Literal["auto", "cpu", "cuda", "reference"] | None = None
     """What computes the fit (default: as the options say, auto); `holosplat backends` lists what there is."""
 
@@ -271,7 +273,8 @@ class MethodOptions:
         """The method that the options name; `InputError` if its backend cannot be used here."""
         from ..backends import resolve
         from ..methods import Auto, Gaussians, Surfaces
-        from ..methods.presets import chosen_method
+        from ..methods.presets import chosen_method, preset
+        from ..tables import overridden
 
         given = [f"--{name}" for name in ("method", "preset", "config") if getattr(self, name) is not None]
         require(len(given) < 2, f"give one of --method, --preset and --config, but there are {' and '.join(given)}.")
@@ -282,8 +285,14 @@ class MethodOptions:
                 f"--start says what Gaussians begin with (--method auto, gaussians or surfaces), but the method is "
                 f"{method.kind}; leave --start.",
             )
-            where = "start" if isinstance(method, Gaussians) else "gaussians.start"
-            method = chosen_method(self.method, self.preset, self.config, (*self.changes, f"{where}={self.start}"))
+            if self.start == "random" and self.preset is None and self.config is None:
+                settings: Method = preset("random")  # others move it too little
+                if isinstance(method, Auto | Surfaces):
+                    settings = replace(method, gaussians=settings)
+                method = overridden(settings, self.changes)
+            else:
+                where = "start" if isinstance(method, Gaussians) else "gaussians.start"
+                method = overridden(method, (*self.changes, f"{where}={self.start}"))
         if self.backend:
             method = method.on_backend(self.backend)
         resolve(self.backend or "auto")  # before the start, which takes its time
@@ -299,7 +308,7 @@ class PriorOptions:
     density: UseAppendAction[tuple[Grams, ...]] = ()
     """Density of each formula [g/cm³], in their order."""
     medium: str | None = None
-    """Formula or name of what surrounds them; none means vacuum."""
+    """Formula or name of what surrounds them (default: vacuum)."""
     medium_density: Grams | None = None
     """The medium's density [g/cm³]."""
     delta_beta: Signed | str | None = None
@@ -338,7 +347,8 @@ class PriorOptions:
         told = [MaterialOptions(*each, *around).filling() for each in self._with_densities()]
         if wall is not None:
             require_in_wall(wall, told[0].medium)
-        return self._sided(MaterialPrior.known(*(each.of("", energy_kev) for each in told), medium=self.medium or ""))
+        medium = self.medium if told[0].medium else None
+        return self._sided(MaterialPrior.known(*(each.of("", energy_kev) for each in told), medium=medium or ""))
 
     def _sided(self, prior: MaterialPrior) -> MaterialPrior:
         """The prior with what `contrast` says."""

@@ -163,6 +163,8 @@ def judge(run: Path, scan: Path | None, truth: Path | None, as_json: bool, readi
     true_volume = read_volume_file(truth, result.delta_told) if truth else None
     if truth is not None and true_volume is not None:
         require_same_field(true_volume.grid, measured.views, truth)
+        wall = measured.exposures.wall
+        true_volume = wall.content(true_volume) if wall else true_volume
     evaluation = evaluate(result, None if predicted else measured, true_volume)
     if truth is not None and evaluation.volume is not None:
         require_overlap(evaluation.volume, truth)

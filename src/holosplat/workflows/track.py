@@ -120,7 +120,8 @@ def track(
         found = follow(
             train, material, options, seed, light=task.uneven, after=after, journal=folder, on_progress=on_progress
         )
-        choice = Choice("levels", {}, "soft fit", found.begun, (*task.decisions, *found.decisions))
+        decisions, against = (*task.decisions, *found.decisions), task.prior.against
+        choice = Choice("levels", {}, "soft fit", found.begun, decisions, against)
         done = _in_motion(found, found.bodies, task, choice, found.oversample)
         if folder is not None:
             folder.start_metrics(dict.fromkeys(name for record in found.records for name in record))

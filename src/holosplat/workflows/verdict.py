@@ -110,15 +110,20 @@ LEAVES = (
     "What lies beyond is not known, so that matter is wrong near these rows and, of soft matter, far from them; take "
     "frames of more rows, to where the matter ends."
 )
+LEAVES_ASIDE = (
+    "Likely cause: matter goes on at the sides of the frames, for the outermost columns have as much of it as the "
+    "others. It lies on the rays of other views, which take it for matter inside; if it is sparse, make it an unknown "
+    "by --method voxels --set volume.beside=0.5, else take frames of more columns."
+)
 NOTHING = "No matter was found: the frames are noise to within what is known of it, or matter is fainter than that."
 """The verdict on an empty object that explains its frames: right where nothing was in the beam, wrong otherwise."""
 OF_NOISE = "What the volume holds was fitted to noise."
 HELP = (
     "If something was in the beam, take more photons, join pixels (--bin), or give more of what is known (--material)."
 )
-OUTER_ROWS, LEAVING, FEW_VIEWS = 2, 0.3, 4
-"""Rows at the top and at the bottom, the part of the mean thickness from which on matter goes on there, and the views
-that are looked at."""
+OUTERMOST, LEAVING, FEW_VIEWS = 2, 0.3, 4
+"""Rows or columns at either edge, the part of the mean thickness from which on matter goes on there, and the views that
+are looked at."""
 
 
 def judge(said: Prediction, frames: Scan, noise: NoiseModel | None = None) -> Verdict:
@@ -137,15 +142,17 @@ def judge(said: Prediction, frames: Scan, noise: NoiseModel | None = None) -> Ve
         return replace(found, good=False, words=NOTHING, reasons=(HELP, *found.reasons)) if found.good else found
     if _shows_nothing(left):
         return replace(found, good=False, words=NOTHING, reasons=(OF_NOISE, HELP), cause="")
-    if found.good or not _leaves_the_field(refracting):
+    if found.good:
         return found
-    return replace(found, reasons=(LEAVES, *found.reasons), cause="")
+    leaves = tuple(why for axis, why in ((1, LEAVES), (2, LEAVES_ASIDE)) if _leaves_the_field(refracting, axis))
+    return replace(found, reasons=(*leaves, *found.reasons), cause="") if leaves else found
 
 
-def _leaves_the_field(matter: torch.Tensor) -> bool:
-    """Whether about as much `matter` [v, H, W] is in the outermost rows of the frames as in the others."""
-    outer = torch.cat([matter[:, :OUTER_ROWS], matter[:, -OUTER_ROWS:]], dim=1)
-    return float(outer.mean()) > LEAVING * float(matter.mean())
+def _leaves_the_field(matter: torch.Tensor, axis: int) -> bool:
+    """Whether about as much `matter` [v, H, W] is in the outermost rows (axis 1) or columns (2) as in the others."""
+    count = matter.shape[axis]
+    outer = [matter.narrow(axis, at, min(OUTERMOST, count)) for at in (0, max(0, count - OUTERMOST))]
+    return float(torch.cat(outer, dim=axis).mean()) > LEAVING * float(matter.mean())
 
 
 def _shows_nothing(found: Residuals) -> bool:

@@ -165,7 +165,7 @@ class NeuralField(Unmoved):
             "origin": list(self.grid.origin),
             "network": to_table(self.network),
             "upper": self.upper,
-            "lower": self.lower,
+            "two_sided": self.lower < 0,  # files hold finite numbers only
             "constants": self._constants,
             "matter": self.matter.as_dict(),
         }
@@ -176,7 +176,7 @@ class NeuralField(Unmoved):
         size, origin = (tuple(float(v) for v in state[name]) for name in ("voxel_size", "origin"))
         grid = Grid(tuple(state["mask"].shape), size, origin)  # type: ignore[arg-type]
         network = from_table(Network, state["network"], "network")
-        lowest = {"lower": float(state.get("lower", 0.0))}  # runs before matter of both sides have none
+        lowest = {"lower": -math.inf if state.get("two_sided", False) else 0.0}  # older runs are of one side
         field = cls(grid, Matter.from_dict(state["matter"]), network, state["mask"], 0, float(state["upper"]), **lowest)
         for name, mine in (("weights", field._weights), ("constants", field._constants)):
             require_shapes(f"{name}/{{}} of the network", state.get(name, {}), mine)
