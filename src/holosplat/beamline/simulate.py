@@ -174,10 +174,11 @@ def _may_jump(phase: torch.Tensor) -> torch.Tensor:
     """[H, W] bool, the samples within which `phase` [H, W] rad may jump along an axis."""
     found = torch.zeros_like(phase, dtype=torch.bool)
     for axis in (0, 1):
-        padded = torch.nn.functional.pad(phase.movedim(axis, 1)[None], (2, 2), mode="replicate")[0]
-        first, second, third, fourth = padded.diff(dim=1).abs().unfold(1, 4, 1).unbind(-1)
+        beyond = torch.zeros_like(phase.narrow(axis, 0, 2))
+        steps = torch.cat((beyond, phase.diff(dim=axis).abs_(), beyond), axis)
+        first, second, third, fourth = (steps.narrow(axis, n, phase.shape[axis]) for n in range(4))
         across = second + third
-        found |= ((across > 2 * STEEP) & (across > ALONE * (first + fourth))).movedim(1, axis)
+        found |= (across > 2 * STEEP) & (across > ALONE * (first + fourth))
     return found
 
 

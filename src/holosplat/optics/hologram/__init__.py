@@ -24,8 +24,8 @@ from ..propagation import angular_spectrum_factor, fresnel_factors, gaussian_fac
 
 SMALL, KEPT = 1 << 20, 8
 """Samples of factors that are kept, at most, and how many: the verdict's views share them, and times of a series."""
-LARGE = 1 << 22
-"""Samples of the latest factors, at most, which are kept beside these: the views of a simulation share them."""
+LARGE = 1 << 24
+"""Samples of the latest factors (128 MB), at most, that are kept beside these: the views of a simulation share them."""
 
 Refraction = Sequence[tuple[float, float]] | np.ndarray | Tensor
 """`(k δ, k β)` of each channel of matter per unit of its line integral: [C, 2] for all views, or [V, C, 2]."""
