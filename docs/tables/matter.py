@@ -16,7 +16,7 @@ HEAD = {
 
 @table("matter", "python benchmarks/matter_scenes.py --seeds 101 102 103 104", "hours", "matter_scenes.csv")
 def scenes() -> str:
-    """Error of δ / Dice / total over the true one, of each kind by each run that there is: the seed of largest error."""
+    """Error of δ / Dice / total over the true one, of each kind and run: the scene of largest error."""
     rows = sorted(read("matter_scenes.csv"), key=lambda row: float(row["error"]))
     runs, lines = [run for run in HEAD if any((row["size"], row["run"]) == run for row in rows)], []
     for kind in KINDS:
