@@ -22,6 +22,7 @@ from holosplat.geometry import Grid
 from holosplat.io.formats import FORMATS, write_volume_file
 from holosplat.io.images import write_tiff
 from holosplat.io.nxtomo import write_scan
+from holosplat.io.phase_maps import PhaseMaps, write_phase_maps
 from holosplat.io.raw_file import ScanFile
 from holosplat.io.volumes import Contents
 from holosplat.matter import DeltaBeta, Matter
@@ -231,6 +232,9 @@ def test_volumes_objects_meshes_and_what_is_none_of_these(shop, tmp_path):
     worked(holosplat("export", shop.run, "--volume", tiff))
     assert rows(tiff)["what"] == ["a volume of δ and β (OME-TIFF)"]
     assert rows(shop.run / "object.h5")["what"] == ["an object (holosplat object 1): GaussianCloud"]
+    scan, maps = two_balls(), tmp_path / "maps.h5"
+    write_phase_maps(maps, PhaseMaps({"phase": scan.frames}, scan.exposures))
+    assert rows(maps)["what"] == ["holosplat phase maps 1"]
     mesh = rows(shop.cells[0])
     assert "triangles" in mesh["shape"][0]
     assert "--length-unit" in mesh["missing"][0]

@@ -67,7 +67,7 @@ def test_runs_get_the_materials_of_the_scene(script, name, materials):
 def test_tables_hold_each_kind_by_each_run(tables, monkeypatch):
     row = {"size": "small", "seed": "101", "run": "told", "error": "0.0269", "dice": "0.99", "total": "1.01"}
     rows = [row | {"kind": "jet"}, row | {"kind": "jet", "run": "Paganin, TV", "error": "inf"}]
-    rows += [row | {"kind": "star", "seed": "102"}, row | {"kind": "star", "size": "large", "error": "0.2"}]
+    rows += [row | {"kind": "star", "size": "large", "error": error} for error in ("0.1", "0.2", "0.15")]
     monkeypatch.setattr(tables, "read", lambda name: rows)
     assert tables.scenes().splitlines()[2:] == [
         "| `jet` | – | 0.027 / 0.990 / 1.01 | refused |",

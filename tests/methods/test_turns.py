@@ -19,7 +19,7 @@ from holosplat.methods import Gaussians, SurfaceOptions, Task
 from holosplat.methods.coarse import CoarseToFine
 from holosplat.methods.first_surfaces import cut_as_seen, in_turns
 from holosplat.methods.method import quiet
-from holosplat.methods.surface_fit import SurfaceFit, cut_surfaces
+from holosplat.methods.surface_fit import FINEST, Extraction, SurfaceFit, cut_surfaces
 
 OPTIONS = Gaussians(coarse=CoarseToFine(coarse_steps=20, views=1))
 HOW = SurfaceOptions(fit=SurfaceFit(schedule=Schedule(steps=20)))
@@ -85,6 +85,12 @@ def test_a_volume_below_all_levels_has_no_surface(noisy):
     cut = partial(cut_surfaces, torch.full(grid.shape, 0.1), grid, PITCH, mesh_of().matter)
     with pytest.raises(InputError, match="no surface"):
         cut_as_seen(noisy, cut, HOW)
+
+
+def test_finer_voxels_leave_out_bodies_of_the_same_size():
+    assert Extraction().finer() == Extraction(spacing=0.5, least_volume=64.0)
+    assert Extraction(spacing=0.4).finer().spacing == FINEST
+    assert Extraction(spacing=FINEST).finer() == Extraction(spacing=FINEST)
 
 
 # --- when turns end -----------------------------------------------------------------------------------------

@@ -78,7 +78,7 @@ def facts_of_matter(path: Path) -> Facts | None:
         for of in (REFRACTION, ABSORPTION):
             if all(isinstance(file.get(name), h5py.Dataset) for name in of.units):
                 return _of_volume(path, file, of)
-    return None
+    return Facts({"what": form} | keys_of(path)) if form.startswith("holosplat ") else None  # phase maps
 
 
 def keys_of(path: Path) -> dict[str, str]:
