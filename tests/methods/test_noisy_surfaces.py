@@ -184,8 +184,8 @@ def test_gaussians_without_a_surface_give_way(noisy, monkeypatch):
     def none(how: Extraction) -> SurfaceMesh:
         raise InputError("no surface")
 
-    cloud = cloud_of_surfaces(mesh_of(1), noisy)
-    stage = BodiesStage(OPTIONS, surfaces=HOW)
+    cloud = cloud_of_surfaces(mesh_of(4), noisy)  # which lacks nothing
+    stage = BodiesStage(EXPLAINED, surfaces=HOW)
     assert len(stage.best_cut(noisy, cloud, none).faces) == len(mesh_of(2).faces)
     monkeypatch.setattr("holosplat.methods.surfaces.begun_surfaces", lambda *given: None)
     with pytest.raises(InputError, match="no surface"):

@@ -19,7 +19,10 @@ from holosplat.methods import Gaussians, SurfaceOptions, Task
 from holosplat.methods.coarse import CoarseToFine
 from holosplat.methods.first_surfaces import cut_as_seen, in_turns
 from holosplat.methods.method import quiet
+from holosplat.methods.start import cloud_of_surfaces
 from holosplat.methods.surface_fit import FINEST, Extraction, SurfaceFit, cut_surfaces
+from holosplat.methods.surfaces import BodiesStage
+from holosplat.representations import SurfaceMesh
 
 OPTIONS = Gaussians(coarse=CoarseToFine(coarse_steps=20, views=1))
 HOW = SurfaceOptions(fit=SurfaceFit(schedule=Schedule(steps=20)))
@@ -85,6 +88,23 @@ def test_a_volume_below_all_levels_has_no_surface(noisy):
     cut = partial(cut_surfaces, torch.full(grid.shape, 0.1), grid, PITCH, mesh_of().matter)
     with pytest.raises(InputError, match="no surface"):
         cut_as_seen(noisy, cut, HOW)
+
+
+@pytest.mark.parametrize("asked", [0.5, 0.6])
+def test_gaussians_are_cut_at_the_level_that_frames_call_for(asked, noisy, monkeypatch):
+    """The lowest has all cells, as thin bodies do; another level that options ask for scales those that are tried."""
+    monkeypatch.setattr("holosplat.methods.surfaces.begun_surfaces", lambda *given: pytest.fail("not asked for"))
+    monkeypatch.setattr("holosplat.methods.surfaces.with_missing_bodies", lambda *given: None)
+    explained = replace(OPTIONS, coarse=replace(OPTIONS.coarse, missing_matter=0.3))
+    levels, how = list[float](), replace(HOW, extraction=replace(HOW.extraction, level=asked))
+
+    def cut(at: Extraction) -> SurfaceMesh:
+        levels.append(at.level)
+        return mesh_of(4 if at.level < 0.5 * asked else 1)
+
+    found = BodiesStage(explained, surfaces=how).best_cut(noisy, cloud_of_surfaces(mesh_of(4), noisy), cut)
+    assert torch.equal(found.vertices, mesh_of(4).vertices)
+    assert levels == pytest.approx([share * asked for share in (0.4, 0.6, 0.8, 1.0, 1.2)])
 
 
 def test_finer_voxels_leave_out_bodies_of_the_same_size():

@@ -106,16 +106,16 @@ class BodiesStage(GaussianStage):
             return cut(self.surfaces.extraction)
         how, seen, found = self.options.coarse, self._without_validation(task), dict[str, SurfaceMesh]()
         steps, most = how.of_views(len(seen.scan.train())), how.missing_matter
-        straight = self._small(task) and self._straight(task)
         try:
             first = cut_as_seen(seen, cut, self.surfaces)
         except InputError:  # Gaussians hold no surface
-            other = self._of_first_volume(task, None) if straight else None
+            other = self._of_first_volume(task, None)
             if other is None:
                 raise
             return other
-        other = self._of_first_volume(task, cloud) if straight else None
-        found |= {} if other is None else {"of a volume": other}
+        other = self._of_first_volume(task, cloud)
+        if other is not None:
+            found["of a volume"] = other
         lacking, small = bool(found) or self._missing(first, task) > most, self._small(task) and how.join_missing
         if not (lacking or small):
             return first
@@ -171,14 +171,16 @@ class BodiesStage(GaussianStage):
     def _of_first_volume(self, task: Task, cloud: GaussianCloud | None) -> SurfaceMesh | None:
         """Surfaces without which Gaussians began, as they explain the frames badly; or, where there are none and
         Gaussians lack much matter or hold no surface (`cloud` is None), those that have taken turns with a volume, of
-        thin bodies, too."""
+        thin bodies, too. Large frames and Gaussians from a random start have none."""
         how = self.options.coarse
+        if not (self._small(task) and self._straight(task)):
+            return None
         if not is_noisy(task, self.options):
             if not (self.poor and self.poor[0][0] is task.scan):  # of a run that was resumed
                 self.near_surfaces(task, self.surfaces)
             if self.poor[0][1] is not None:
                 return self.poor[0][1]
-        if cloud and self._missing(cloud, task) <= how.missing_matter:
+        if cloud is not None and self._missing(cloud, task) <= how.missing_matter:
             return None
         seen = self._without_validation(task)
         return begun_surfaces(seen, lambda at: surfaces_of_volume(at, self.options, self.surfaces), self.surfaces, how)

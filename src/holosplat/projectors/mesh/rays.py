@@ -15,8 +15,7 @@ from torch import Tensor
 from ...geometry import Grid
 
 MAX_HITS = {"cpu": 1_000_000, "cuda": 16_000_000}
-"""Hits held in memory at once, by the kind of device: some 0.1 and 2 GB. A CPU is slower with
-more, for its caches hold less."""
+"""Hits held in memory at once, by the kind of device: some 0.1 and 2 GB. More do not fit a CPU's caches."""
 
 NUDGE = (3.1e-8, 7.3e-8)
 """Lattice offset (columns, rows): keeps rays off vertices of axis-aligned bodies; far below any accuracy."""
