@@ -17,7 +17,7 @@ from holosplat.methods import METHODS, SmoothVolume, Task, contrast
 from holosplat.methods.contrast import BELOW, BOTH, SPHERICAL, _refuted, both_sides, decide_sides, with_sign
 from holosplat.methods.illumination import prepared
 from holosplat.methods.method import first_of_task
-from holosplat.methods.spherical import AXES, Sphere, SphericalFit
+from holosplat.methods.spherical import AXES, Sphere, SphericalFit, SphericalMatter
 from holosplat.methods.volume import SmoothStage
 from holosplat.optics.background import LightOptions
 from holosplat.optics.noise import NoiseModel
@@ -55,20 +55,44 @@ def sphere_of(scan: Scan, start: torch.Tensor) -> Sphere:
     return Sphere(WhitenedFrames(scan, WATER, NoiseModel.white_only(torch.full((3,), 0.02), SHAPE)), start)
 
 
-def test_steps_follow_the_derivatives_of_the_volume(scan):
-    """Of centre and values, beside central differences, on a field of odd and unequal sides."""
-    sphere = sphere_of(scan, torch.zeros(SHAPE[1], *SHAPE))
-    count = len(sphere.unknowns) - AXES
-    assert count == SHAPE[0] // 2
-    values = torch.sin(torch.arange(count, dtype=torch.float64))
-    sphere.unknowns = torch.cat([torch.tensor([17.3, 15.6, 18.9], dtype=torch.float64), values])
-    for number, change in enumerate(sphere._changes()):
-        step = torch.zeros_like(sphere.unknowns)
-        step[number] = 1e-3
-        ends = [sphere.volume(sphere.unknowns + sign * step).double() for sign in (1, -1)]
-        wanted, kinks = (ends[0] - ends[1]) / 2e-3, 0.02  # radii pass from one shell to the next within a step
-        assert float(((wanted - change).abs() > 1e-3).double().mean()) < kinks
-        assert float((wanted - change).norm() / wanted.norm()) < 0.1
+@pytest.mark.parametrize("source", [None, 70e-6], ids=["parallel", "cone"])
+def test_line_integrals_are_those_of_a_quadrature(source):
+    """Of a random profile, on pixels of two sizes and detectors that are shifted; derivatives beside differences."""
+    turns, shifts = hs.Views.from_angles([10.0, 70.0], (11, 15), PIXEL).rotations, np.array([[0.3, -0.2], [0.0, 0.5]])
+    sources = None if source is None else np.array([source, 1.2 * source])
+    views = Views(turns, PIXEL * shifts, (11, 15), PIXEL, np.array([1.0, 1.2]), sources)
+    values, spacing = torch.from_numpy(np.random.default_rng(0).normal(size=5)), 1.1 * PIXEL
+    matter = SphericalMatter(PIXEL * np.array([0.7, -1.2, 2.1]), spacing, values, WATER)
+    found, at = matter.project(views), np.linspace(-25, 25, 20001) * PIXEL
+    for v, pixel in enumerate(views.pixel_sizes):
+        for row, column in ((5, 7), (3, 8), (6, 5)):
+            place = np.array([(column - 7) * pixel, (row - 5) * pixel, 0.0]) + [*views.shifts[v], 0.0]
+            way = np.array([0.0, 0.0, 1.0]) + (0 if sources is None else [*place[:2] / sources[v], 0.0])
+            points = place + at[:, None] * way / np.linalg.norm(way) - turns[v] @ matter.centre
+            radii = np.linalg.norm(points, axis=1) / spacing
+            wanted = np.interp(radii, np.arange(6), [*values.tolist(), 0.0]).sum() * (at[1] - at[0])
+            assert float(found.channels[v, 0, row, column]) == pytest.approx(wanted, abs=1e-5 * PIXEL)
+    assert found.materials == (WATER,)
+
+    def lines(number: int, step: float) -> torch.Tensor:
+        moved = torch.zeros(AXES + len(values), dtype=torch.float64)
+        moved[number] = step
+        centre = matter.centre + spacing * moved[:AXES].numpy()
+        return SphericalMatter(centre, spacing, values + moved[AXES:], WATER).lines(views).double()
+
+    for number, slope in enumerate(matter.slopes(views)):
+        wanted = (lines(number, 1e-3) - lines(number, -1e-3)) / 2e-3
+        assert float((wanted - slope).norm() / wanted.norm()) < 2e-3
+
+
+def test_voxels_hold_the_profile_and_its_integral():
+    grid = Grid.centred((27, 25, 23), PIXEL)
+    unknowns = torch.tensor([11.2, 12.4, 13.1, 0.4, 1.0, -0.7, 0.2, 0.6, 0.0], dtype=torch.float64)
+    centre = np.array(grid.origin) + PIXEL * unknowns[:AXES].numpy()
+    matter = SphericalMatter(centre, PIXEL, unknowns[AXES:], WATER)
+    fine = matter.voxelise(Grid.centred((135, 125, 115), PIXEL / 5)).delta / WATER.delta
+    assert Sphere.sum_of(unknowns) == pytest.approx(float(fine.sum()) / 125, rel=2e-3)
+    assert float(matter.voxelise(grid).beta.sum() / WATER.beta) == pytest.approx(float(fine.sum()) / 125, rel=0.2)
 
 
 def test_a_total_that_is_told_counts_by_its_error(scan, shock):
@@ -80,7 +104,7 @@ def test_a_total_that_is_told_counts_by_its_error(scan, shock):
         sphere = Sphere(whitened, truth, told=told)
         while not sphere.ended:
             sphere.step()
-        sums.append(float(sphere.volume().double().sum()))
+        sums.append(Sphere.sum_of(sphere.unknowns))
     error = Sphere(whitened, truth).errors()[0]
     assert sums[1] == pytest.approx(sums[0], abs=0.05 * error)
     assert sums[2] == pytest.approx(300.0, abs=0.1)
@@ -104,7 +128,7 @@ def test_a_sphere_that_has_left_the_field_ends(scan):
     sphere.unknowns[0] = 900.0
     sphere.step()
     assert sphere.ended
-    assert not sphere.volume().any()
+    assert not sphere.matter().voxelise(sphere.grid).delta.any()
 
 
 def test_a_shock_is_found_in_three_beams(scan, shock):
@@ -155,7 +179,8 @@ def test_radii_beyond_the_front_are_left_out(scan):
     assert isinstance(fit, SphericalFit)
     assert 13 <= fit.resolved()["radii"] <= 18
     values = fit.voxels.values[0]
-    away = (fit._sphere._places - fit._sphere.unknowns[:AXES, None, None, None]).norm(dim=0)
+    z, y, x = np.indices(values.shape)
+    away = np.linalg.norm(np.stack([x, y, z]) - fit._sphere.unknowns[:AXES].numpy()[:, None, None, None], axis=0)
     assert not values[away > 19].any()
     assert values[away < 13].any()
 

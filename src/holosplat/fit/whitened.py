@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -130,12 +131,20 @@ class WhitenedFrames:
         if doubt is not None and doubt.background is not None:
             self._own = (0.25 * (doubt.noise.power() + error + FAINTEST)).float().to(on)
             self._apart = LightProjection(self._amplitudes, doubt.background.covariances, self._over_noise)
-        self._sharp = self._sharpening().to(on)
+        self._sampled, self._sharp = False, self._sharpening().to(on)
 
     @property
     def count(self) -> int:
         """How many pixels all frames have."""
         return self._amplitudes.numel()
+
+    def of_samples(self) -> WhitenedFrames:
+        """The same misfit of line integrals [V, H', W'] in pixels at the samples of the waves (`instrument.views`): as
+        fine as the first fringe needs."""
+        exposures, found = self.train.exposures, copy(self)
+        found.instrument = Instrument(exposures, fringe_sampling(exposures), backend=self.instrument.backend)
+        found._sampled = True
+        return found
 
     def curvature(self) -> Tensor:
         """About the second derivative [V, H, W//2 + 1] by the lines in the frames, at each frequency of `rfft2`.
@@ -170,6 +179,8 @@ class WhitenedFrames:
 
     def _waves(self, lines: Tensor) -> Tensor:
         """Line integrals [V, H, W] in pixels as those [m] on the raster of the waves."""
+        if self._sampled:
+            return lines * self.pixel
         (my, mx), s = self.instrument.margin, self.instrument.oversample
         (my, mx) = (m - more for m, more in zip((my, mx), self.beyond))  # below 0 it cuts
         padded = pad(lines, (mx, mx, my, my)) * self.pixel

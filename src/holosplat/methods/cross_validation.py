@@ -36,7 +36,7 @@ from ..progress import Progress
 from ..representations import Stored, VoxelGrid
 from ..scan import Exposures, Scan
 from ..volume import Object
-from .spherical import likeliest_sphere
+from .spherical import SphericalMatter, likeliest_sphere
 
 DRAWS = 16
 """Of the noise, for what it leaves of the matter: a standard deviation by so many is right to a sixth."""
@@ -252,7 +252,7 @@ class FirstVolumes:
             raise found
         return found  # type: ignore[return-value]
 
-    def volume(self, fold: int, light: Light) -> VoxelGrid:
+    def volume(self, fold: int, light: Light) -> VoxelGrid | SphericalMatter:
         """The volume of the fitted frames of a fold, which were measured in `light`."""
         seen, _ = self.folds.split(fold)
         even, lines = replace(seen, frames=light.evened(torch.from_numpy(seen.frames)).numpy()), None
@@ -262,7 +262,7 @@ class FirstVolumes:
         if self.prior.spherical:
             beyond = margins_of(grid, seen.views)
             frames = WhitenedFrames(even, self.material, light.noise, beyond=beyond)
-            values = likeliest_sphere(frames, values, self.prior.lower)
+            return likeliest_sphere(frames, values, self.prior.lower)
         return VoxelGrid(values[None], grid, Matter.one(*self.material)).on(resolve(self.options.backend))
 
     def thickness(self, fold: int, material: DeltaBeta, how: HolographicTV) -> Tensor:

@@ -102,6 +102,7 @@ class _FlatVolumes:
 
     def _flat(self, fold: int) -> tuple[Trial, list[VoxelGrid]]:
         trial = accepted(self._task, self._first, fold)
+        assert isinstance(trial.volume, VoxelGrid)  # spherical matter is continuous
         grid, seen = trial.volume.grid, trial.seen
         pixel = max(1, round(seen.views.finest / grid.voxel_size[0]))
         flat = (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,11 +17,16 @@ from ..backends import resolve
 from ..fit.run import Record, interrupts_held
 from ..fit.smooth_volume import ContinuousPrior, VolumeProblem
 from ..fit.whitened import WhitenedFrames
+from ..geometry import Grid, Views
+from ..matter import DeltaBeta
 from ..memory import memory_kept
 from ..model import Instrument, Model
 from ..representations import VoxelGrid
+from ..volume import LineIntegrals, Unmoved, Volume
 
 AXES = 3
+NEAREST = 1e-9
+"""Distance of a ray from the centre at least, in units of the spacing: no ray's derivative has a direction there."""
 LEAST = 1e-12
 """Least second derivative, as a share of the largest."""
 DAMPED, EASED, MOST_DAMPED = 1e-3, 10.0, 1e6
@@ -60,12 +65,87 @@ class ProfileErrors:
         return cls(tuple(map(float, values["centre_m"])), float(values["spacing_m"]), covariance)
 
 
-class Sphere:
-    """The likeliest spherical volume, by Gauss and Newton's steps with damping (Levenberg 1944, Marquardt 1963).
+@dataclass(frozen=True)
+class SphericalMatter(Unmoved):
+    """Matter that is spherical, of exact line integrals: no voxel blurs its fronts.
 
-    Unknowns are the centre (z, y, x) in voxels and the values at the radii 0, 1, … voxels below half the shorter side;
-    they are linear between, and 0 beyond. So few unknowns need no prior: hundreds of pixels tell each of them. In a
-    step those values are fixed at the bound `lower` that the gradient would keep there (Bertsekas 1982).
+    centre: `(x, y, z)` [m]; spacing: of the radii 0, 1, … of the profile [m]; values: [K] float64, occupancies at
+    these, between which it is linear, and 0 beyond; material: δ and β of an occupancy of one.
+    """
+
+    centre: np.ndarray
+    spacing: float
+    values: Tensor
+    material: DeltaBeta
+
+    def project(self, views: Views) -> LineIntegrals:
+        """Line integrals of the material [V, 1, H, W] [m], at the centres of pixels."""
+        return LineIntegrals((self.spacing * self.lines(views))[:, None], (self.material,))
+
+    def voxelise(self, grid: Grid) -> Volume:
+        """δ and β at the centres of voxels."""
+        x, y, z = grid.axes()
+        away = [at - middle for at, middle in zip((x, y[:, None], z[:, None, None]), self.centre)]
+        radius = np.sqrt(sum(np.square(one) for one in away)) / self.spacing
+        values = np.interp(radius, np.arange(len(self.values) + 1), [*self.values.tolist(), 0.0])
+        return Volume(values * self.material.delta, values * self.material.beta, grid)
+
+    def lines(self, views: Views) -> Tensor:
+        """Line integrals [V, H, W] of the occupancy in units of the spacing, float32.
+
+        With `q(n) = ½ (n √(n² - ρ²) - ρ² arcosh(n / ρ))` at a distance ρ < n from the centre, else 0, they are
+        `2 Σ q(n) (u(n-1) - 2 u(n) + u(n+1))`: Abel's transform of straight pieces (Bracewell 2000, chapter 14).
+        """
+        ends = torch.cat([self.values, self.values.new_zeros(2)])
+        bends = (2 * ends.diff(n=2)).tolist()  # at the radii 1, 2, …
+        found = [torch.stack([b * _rings(r, n + 1) for n, b in enumerate(bends)]).sum(0) for r, _ in self._seen(views)]
+        return torch.stack(found).float()
+
+    def slopes(self, views: Views) -> list[Tensor]:
+        """Derivatives [V, H, W] of `lines` by the centre along x, y, z, in units of the spacing, and by the values."""
+        ends = torch.cat([self.values, self.values.new_zeros(2)])
+        bends = 2 * ends.diff(n=2)
+        count, per_view = len(self.values), list[Tensor]()
+        for radius, way in self._seen(views):
+            angles = [-radius * (n / radius).clamp_min(1).acosh() for n in range(1, count + 1)]  # of q by ρ
+            moved = sum(bend * angle for bend, angle in zip(bends.tolist(), angles)) * way
+            rings = torch.stack([torch.zeros_like(radius)] * 2 + [_rings(radius, n) for n in range(1, count + 1)])
+            per_view.append(torch.cat([moved, 2 * rings.diff(n=2, dim=0)]).float())
+        return list(torch.stack(per_view, dim=1))
+
+    def _seen(self, views: Views) -> Iterator[tuple[Tensor, Tensor]]:
+        """Of each view the distances [H, W] of the centre from the pixels' rays, in units of the spacing, and the
+        direction [3, H, W] in which the centre moves away from them."""
+        h, w = views.shape
+        for v, rotation in enumerate(views.rotations):
+            pitch, (sx, sy) = views.pixel_sizes[v], views.shifts[v]
+            y, x = np.meshgrid(
+                (np.arange(h) - 0.5 * (h - 1)) * pitch + sy, (np.arange(w) - 0.5 * (w - 1)) * pitch + sx, indexing="ij"
+            )
+            place, way = np.stack([x, y, np.zeros_like(x)]), np.zeros((3, h, w))
+            way[2] = 1.0
+            if views.sources is not None:
+                way = place + views.sources[v] * way
+                way /= np.linalg.norm(way, axis=0)
+            away = (rotation @ self.centre)[:, None, None] - place
+            away -= (away * way).sum(axis=0) * way
+            radius = np.maximum(np.linalg.norm(away, axis=0) / self.spacing, NEAREST)
+            direction = np.tensordot(rotation.T, away, 1) / (radius * self.spacing)
+            yield torch.from_numpy(radius), torch.from_numpy(direction)
+
+
+def _rings(radius: Tensor, n: int) -> Tensor:
+    """q(n) of `SphericalMatter.lines` at the distances `radius`."""
+    inside = radius.clamp_max(n)
+    return 0.5 * (n * (n**2 - inside.square()).sqrt() - inside.square() * (n / inside).acosh())
+
+
+class Sphere:
+    """The likeliest spherical matter, by Gauss and Newton's steps with damping (Levenberg 1944, Marquardt 1963).
+
+    Unknowns are the centre (x, y, z) in voxels of a pixel from the origin of their grid, and the values at the radii
+    0, 1, … voxels below half the shorter side. So few unknowns need no prior: hundreds of pixels tell each of them. In
+    a step those values are fixed at the bound `lower` that the gradient would keep there (Bertsekas 1982).
 
     frames: in units of their noise; start [Z, Y, X]: a volume of them, whose means over spheres are where the fit
     begins, about the point by whose reflection the frames change least (`_symmetric_about`); told: what the sum of the
@@ -80,14 +160,14 @@ class Sphere:
         lower: float = -math.inf,
         told: tuple[float, float] | None = None,
     ) -> None:
-        self.told = told
-        self.problem = VolumeProblem(frames, ContinuousPrior(two_sided=True), 1.0, backend)
-        axes = [torch.arange(n, dtype=torch.float64) for n in start.shape]
-        self._places = torch.stack(torch.meshgrid(*axes, indexing="ij"))
+        self.told, self.frames, self.grid = told, frames.of_samples(), Grid.of_views(frames.field)
         rows, columns = frames.beyond
         contrast = pad(frames.known(frames.measured - 1), (columns, columns, rows, rows))
-        count, centre = max(1, min(start.shape) // 2), _symmetric_about(self.problem.backprojection(contrast).cpu())
-        near = (self._places - centre[:, None, None, None]).norm(dim=0).round().long().clamp_max(count).flatten()
+        problem = VolumeProblem(frames, ContinuousPrior(two_sided=True), 1.0, backend)
+        count, centre = max(1, min(start.shape) // 2), _symmetric_about(problem.backprojection(contrast).cpu())
+        axes = [torch.arange(n, dtype=torch.float64) for n in start.shape]
+        places = torch.stack(torch.meshgrid(*axes, indexing="ij"))
+        near = (places - centre.flip(0)[:, None, None, None]).norm(dim=0).round().long().clamp_max(count).flatten()
         sums, members = (torch.zeros(count + 1, dtype=torch.float64) for _ in range(2))
         sums.index_add_(0, near, start.double().cpu().flatten())
         members.index_add_(0, near, torch.ones_like(near, dtype=torch.float64))
@@ -96,16 +176,16 @@ class Sphere:
         self.value, self.damping, self.done = self._value(self.unknowns), DAMPED, 0
         self.cut, self.ended = False, False
 
-    def volume(self, unknowns: Tensor | None = None) -> Tensor:
-        """The volume [Z, Y, X]."""
+    def matter(self, unknowns: Tensor | None = None) -> SphericalMatter:
+        """What the unknowns are of."""
         unknowns = self.unknowns if unknowns is None else unknowns
-        _, shell, part = self._shells(unknowns)
-        values = torch.cat([unknowns[AXES:], unknowns.new_zeros(2)])
-        return torch.lerp(values[shell], values[shell + 1], part).float()
+        edge = self.grid.voxel_size[0]
+        centre = np.array(self.grid.origin) + edge * unknowns[:AXES].numpy()
+        return SphericalMatter(centre, edge, unknowns[AXES:], self.frames.material)
 
     def step(self) -> None:
         """One step, if any helps; where none does for the first time, the profile is cut (`_cut`), and it goes on."""
-        level, matrix, missing, _ = self._equations()
+        level, matrix, missing = self._equations()
         if not matrix.any():  # the centre has left the field, and nothing is seen of the sphere
             self.ended = True
             return
@@ -130,26 +210,27 @@ class Sphere:
         """Standard error of the sum of the volume, and covariance of the unknowns, of which no value is unknown beyond
         the last one that is not 0. The error of the sum is large, for frames hardly tell slow changes of the profile.
         """
-        level, matrix, _, sums = self._equations()
+        level, matrix, _ = self._equations()
         last = AXES + 1 + int(self.unknowns[AXES:].nonzero().max())
-        matrix, sums, level = matrix[:last, :last], sums[:last], level[:last]
+        matrix, sums, level = matrix[:last, :last], (_volumes(self.unknowns) * level)[:last], level[:last]
         regular = matrix + LEAST * matrix.diag().max() * torch.eye(last, dtype=matrix.dtype)
         covariance = torch.linalg.inv(regular)
         return math.sqrt(float(sums @ covariance @ sums)), covariance * torch.outer(level, level)
 
-    def _equations(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Units of the unknowns, and in these the second derivatives, minus the gradient, and the slopes of the sum."""
+    def _equations(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Units of the unknowns, and in these the second derivatives, and minus the gradient."""
         level = torch.ones_like(self.unknowns)
         level[AXES:] = float(self.unknowns[AXES:].abs().max()) or 1.0  # in smaller units rounding hides the slopes
-        changes = [one * float(unit) for one, unit in zip(self._changes(), level)]
-        seen = [self.problem.lines(self._there(one)) for one in (self.volume(), *changes)]
-        matrix, missing = (each.cpu() for each in self.problem.frames.normal_equations(seen[0], seen[1:]))
-        sums = torch.stack([one.double().sum() for one in changes])
+        matter, views = self.matter(), self.frames.instrument.views
+        changes = [self._there(one) * float(unit) for one, unit in zip(matter.slopes(views), level)]
+        equations = self.frames.normal_equations(self._there(matter.lines(views)), changes)
+        matrix, missing = (each.cpu() for each in equations)
         if self.told:
             value, error = self.told
+            sums = _volumes(self.unknowns) * level
             matrix = matrix + torch.outer(sums, sums) / error**2
-            missing = missing + sums * (value - float(self.volume().double().sum())) / error**2
-        return level, matrix, missing, sums
+            missing = missing + sums * (value - self.sum_of(self.unknowns)) / error**2
+        return level, matrix, missing
 
     def _cut(self, matrix: Tensor, unknowns: Tensor) -> None:
         """Leave out the outermost values as far as the frames do not tell them from 0, by Akaike's criterion (1974): a
@@ -168,47 +249,45 @@ class Sphere:
         self.unknowns, self.lower = self.unknowns[: AXES + kept], self.lower[: AXES + kept]
         self.value, self.damping, self.cut = self._value(self.unknowns), DAMPED, True
 
-    def _shells(self, unknowns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Radii [Z, Y, X], the last of the unknown radii below each, and how far beyond it they are."""
-        radius = (self._places - unknowns[:AXES, None, None, None]).norm(dim=0)
-        shell = radius.long().clamp_max(len(unknowns) - AXES)
-        return radius, shell, (radius - shell).clamp_max(1.0)
-
-    def _changes(self) -> list[Tensor]:
-        """Derivatives [Z, Y, X] of the volume by the unknowns."""
-        radius, shell, part = self._shells(self.unknowns)
-        values = torch.cat([self.unknowns[AXES:], self.unknowns.new_zeros(2)])
-        slope = (values[shell + 1] - values[shell]) / radius.clamp_min(0.5)
-        moved = [(slope * (centre - place)).float() for centre, place in zip(self.unknowns, self._places)]
-        hats = [((shell == n) * (1 - part) + (shell == n - 1) * part).float() for n in range(len(values) - 2)]
-        return [*moved, *hats]
-
     def _value(self, unknowns: Tensor) -> float:
-        volume = self.volume(unknowns)
-        misfit = self.problem.frames(self.problem.lines(self._there(volume))).value
-        away = (float(volume.double().sum()) - self.told[0]) / self.told[1] if self.told else 0.0
+        lines = self.matter(unknowns).lines(self.frames.instrument.views)
+        misfit = self.frames(self._there(lines)).value
+        away = (self.sum_of(unknowns) - self.told[0]) / self.told[1] if self.told else 0.0
         return misfit + 0.5 * away**2
 
-    def _there(self, volume: Tensor) -> Tensor:
-        return volume.to(self.problem.device)
+    @staticmethod
+    def sum_of(unknowns: Tensor) -> float:
+        """Integral of the occupancy over all space, in voxels."""
+        return float(_volumes(unknowns) @ unknowns)
+
+    def _there(self, lines: Tensor) -> Tensor:
+        return lines.to(self.frames.instrument.device)
+
+
+def _volumes(unknowns: Tensor) -> Tensor:
+    """Slopes of the integral over all space by the unknowns of a `Sphere`: `4π ∫ h r² dr` of the values' hats h."""
+    radii = torch.arange(len(unknowns) - AXES, dtype=torch.float64)
+    hats = radii.square() + 1 / 6
+    hats[:1] = 1 / 12
+    return torch.cat([torch.zeros(AXES, dtype=torch.float64), 4 * math.pi * hats])
 
 
 def _symmetric_about(volume: Tensor) -> Tensor:
-    """The point (z, y, x), in half voxels, about which a volume is most nearly its own reflection: half of where its
+    """The point (x, y, z), in half voxels, about which a volume is most nearly its own reflection: half of where its
     convolution with itself is largest. What few views smear of a sphere is as symmetric as the sphere, and so are its
     fringes, which noise hides less than what is retrieved of them."""
     twice = [2 * n for n in volume.shape]
     convolved = torch.fft.irfftn(torch.fft.rfftn(volume, s=twice).square(), s=twice)
     index = np.unravel_index(int(convolved.argmax()), convolved.shape)
-    return 0.5 * torch.tensor([float(n) for n in index], dtype=torch.float64)
+    return 0.5 * torch.tensor([float(n) for n in index[::-1]], dtype=torch.float64)
 
 
-def likeliest_sphere(frames: WhitenedFrames, start: Tensor, lower: float) -> Tensor:
-    """The spherical volume [Z, Y, X] at which a `Sphere` ends."""
+def likeliest_sphere(frames: WhitenedFrames, start: Tensor, lower: float) -> SphericalMatter:
+    """The matter at which a `Sphere` ends."""
     sphere = Sphere(frames, start, lower=lower)
     while not sphere.ended:
         sphere.step()
-    return sphere.volume().to(start)
+    return sphere.matter()
 
 
 class SphericalFit:
@@ -225,12 +304,12 @@ class SphericalFit:
         self.backend, self.step, self.seconds, self._begun = resolve(backend), 0, 0.0, begun
         self._unit = math.prod(begun.grid.voxel_size) * begun.matter.delta
         known = (told[0] / self._unit, told[1] / abs(self._unit)) if told else None
-        self._sphere = Sphere(frames, begun.values[0], self.backend, lower, known)
+        self._frames, self._sphere = frames, Sphere(frames, begun.values[0], self.backend, lower, known)
 
     @property
     def oversample(self) -> int:
         """Wave samples a pixel."""
-        return self._sphere.problem.frames.instrument.oversample
+        return self._frames.instrument.oversample
 
     @property
     def finished(self) -> bool:
@@ -245,7 +324,7 @@ class SphericalFit:
     def errors(self) -> tuple[float, ProfileErrors]:
         """Standard error of the total δ [m³], and those of centre and profile."""
         error, covariance = self._sphere.errors()
-        centre = covariance.diag()[:AXES].sqrt().flip(0) * self._begun.grid.voxel_size[0]
+        centre = covariance.diag()[:AXES].sqrt() * self._begun.grid.voxel_size[0]
         values = covariance[AXES:, AXES:] * self._begun.matter.delta**2
         spacing, unit = self._begun.grid.voxel_size[0], abs(self._unit)
         return error * unit, ProfileErrors(tuple(centre.tolist()), spacing, values.numpy())
@@ -253,11 +332,12 @@ class SphericalFit:
     @property
     def voxels(self) -> VoxelGrid:
         """The volume as it is now."""
-        return self._begun.with_parameters({"values": self._sphere.volume()[None]})
+        delta = self._sphere.matter().voxelise(self._begun.grid).delta / self._begun.matter.delta
+        return self._begun.with_parameters({"values": torch.from_numpy(delta).float()[None]})
 
     def result(self) -> Model:
         """The model of the volume as it is now."""
-        exposures = self._sphere.problem.frames.train.exposures
+        exposures = self._frames.train.exposures
         return Model(self.voxels, Instrument(exposures, self.oversample, backend=self.backend))
 
     def resolved(self) -> dict[str, Any]:

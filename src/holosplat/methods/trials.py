@@ -33,6 +33,7 @@ from .cross_validation import (
 )
 from .keeper import NAME, Unseen
 from .method import Method, Task, run_stages, unheard
+from .spherical import SphericalMatter
 
 NULL = "as measured"
 UNEVEN = "uneven light"
@@ -74,7 +75,7 @@ class Trial:
     """A hypothesis in a fold. volume: by the fitted frames `seen`; light: what the hypothesis says of these; unseen,
     expected: the frames that are not fitted, and what the volume predicts for them in even light"""
 
-    volume: VoxelGrid
+    volume: VoxelGrid | SphericalMatter
     light: Light
     seen: Scan
     unseen: Scan
