@@ -67,11 +67,11 @@ def test_a_family_without_its_data_is_skipped_with_a_sentence(scenes, tmp_path):
 
 def test_what_is_told_is_not_decided(families, scenes, monkeypatch):
     monkeypatch.setattr(families, "METHOD", METHODS["holographic-tv"].options)
-    made = scenes.scene("soft cells, few views", 1, None)
-    done = families.run("soft cells, few views", 1, made, ("fixed pattern", "levels"))
+    made = scenes.scene("fixed pattern", 1, None)
+    done = families.run("fixed pattern", 1, made, ("fixed pattern", "levels"))
     assert (done.light, done.told, done.use) == ("fixed pattern", "yes", "development")
     assert "light and noise" not in done.decisions
-    plain = families.run("soft cells, few views", 101, made, families.NULLS)
+    plain = families.run("fixed pattern", 101, made, families.NULLS)
     assert plain.error != done.error
     assert plain.use == "reporting"
 

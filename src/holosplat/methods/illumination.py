@@ -5,8 +5,7 @@ Each is carried as far as a volume, and taken only where this predicts unseen me
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 
@@ -17,7 +16,7 @@ from torch import Tensor
 from ..backends import resolve
 from ..baselines import HolographicTV, holographic_tv
 from ..checks import InputError, require
-from ..inference import Compared, Decision, Score, select
+from ..inference import Decision, Score, select
 from ..matter import MaterialPrior, Matter, MatterKind
 from ..optics.background import FLUX, Light, LightOptions
 from ..progress import Progress
@@ -30,12 +29,12 @@ from .contrast import Scoring, decide_sides, decide_sign, with_sign
 from .cross_validation import BY_FISSION, EFFORT, FirstVolumes, assumed_material, plain_light, predicted_frames
 from .levels import SHOWN, TrialFits, at_decided, blind, decide_ratio
 from .method import Method, Task, first_of_task, one_material
-from .trials import ODD_PATTERN, PATTERN, UNEVEN, WITHOUT, Hypothesis, Trials, name_of, named, rivals, with_more
+from .trials import UNEVEN, WITHOUT, Hypothesis, Trials, name_of, named, rivals, with_more
 from .volume import SmoothVolume
 
 STAGE = "light and noise"
 CORRELATED = "correlated noise"
-HYPOTHESES = (PATTERN, FLUX, UNEVEN, CORRELATED)
+HYPOTHESES = ("fixed pattern", FLUX, UNEVEN, CORRELATED)
 """What may be added to the null, in this order where several predict alike."""
 
 Prepared = tuple[Hypothesis, tuple[Decision, ...]]
@@ -58,26 +57,16 @@ def decided(
     trials, taken, made = Trials(first, options), told, list[Decision]()
     by = first.folds.by if scored is None else f"{first.folds.by}, by fits"
     if first.folds.by == BY_FISSION:  # of two views, a pattern is what volumes leave in both
-        hypotheses = tuple(one for one in hypotheses if one != PATTERN)
-    while left := [(*taken, one) for one in hypotheses if one not in taken and trials.proposed((*taken, one))]:
-        found, decision = _beyond(taken, left, scored or trials.score, by, first.folds.count)
+        hypotheses = tuple(one for one in hypotheses if one != "fixed pattern")
+    while left := [one for one in hypotheses if one not in taken and trials.proposed((*taken, one))]:
+        null, names = name_of(taken), [name_of((*taken, one)) for one in left]
+        beside = {name: rivals(taken, one) for name, one in zip(names, left)}
+        decision = select(STAGE, (null, *names), scored or trials.score, first.folds.count, by=by, beside=beside)
         made.append(decision)
-        if found == taken:
+        if decision.choice == null:
             break
-        taken = found
+        taken = named(decision.choice)
     return taken, tuple(made)
-
-
-def _beyond(
-    taken: Hypothesis, hypotheses: Sequence[Hypothesis], score: Scored, by: str, folds: int = 1, surely: bool = True
-) -> tuple[Hypothesis, Decision]:
-    """The best of some `hypotheses` that add one part to others, or `taken` where it stands, and the decision. A fixed
-    pattern competes by its odd part alone."""
-    names = {name_of((*each[:-1], ODD_PATTERN) if each[-1] == PATTERN else each): each for each in hypotheses}
-    beside = {name: rivals(each[:-1], each[-1]) for name, each in names.items()}
-    decision = select(STAGE, (name_of(taken), *names), score, folds, by=by, beside=beside, surely=surely)
-    found = names.get(decision.choice, taken)
-    return found, replace(decision, choice=name_of(found))
 
 
 def shows_matter(first: FirstVolumes, options: LightOptions, taken: Hypothesis) -> Decision:
@@ -105,16 +94,15 @@ def confirmed(task: Task, first: FirstVolumes, told: Hypothesis) -> Decision:
     shown in every fold; by fits to one of them it must be of practical size.
     """
     fits = TrialFits(task, first, {"continuous": SmoothVolume(rounds=1).with_effort(EFFORT)})
-    taken, compared, by = told, list[Compared](), f"{first.folds.by}, by fits"
-    began = time.perf_counter()
+    counts = range(len(told), len(first.taken))
+    candidates = [name_of(first.taken[:count]) for count in (*counts, len(first.taken))]
+    beside = {name_of(first.taken[: n + 1]): rivals(first.taken[:n], first.taken[n]) for n in counts}
+    by = f"{first.folds.by}, by fits"
 
     def scored(name: str, fold: int) -> Score:
         return fits.score(name, "continuous", fold)
 
-    for count in range(len(told) + 1, len(first.taken) + 1):
-        taken, decision = _beyond(taken, [first.taken[:count]], scored, by, surely=False)
-        compared += decision.compared
-    return Decision(STAGE, name_of(taken), by, tuple(compared), round(time.perf_counter() - began, 2))
+    return select(STAGE, candidates, scored, by=by, beside=beside, surely=False)
 
 
 def prepared(task: Task, method: Method | None = None, before: Prepared | None = None) -> Task:
@@ -194,7 +182,7 @@ def _open_to(task: Task, method: Method | None) -> Hypothesis:
     """The hypotheses that are asked for."""
     options = task.light
     asked = {
-        PATTERN: options.still == "auto" and options.kind != "even" and not still_order(method),
+        "fixed pattern": options.still == "auto" and options.kind != "even" and not still_order(method),
         FLUX: options.kind == "auto" and not task.scan.is_series,  # several times have no one volume
         UNEVEN: options.kind == "auto",
         CORRELATED: options.noise == "auto",

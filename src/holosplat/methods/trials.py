@@ -36,9 +36,7 @@ from .method import Method, Task, run_stages, unheard
 from .spherical import SphericalMatter
 
 NULL = "as measured"
-UNEVEN, PATTERN = "uneven light", "fixed pattern"
-ODD_PATTERN = "odd part of a fixed pattern"
-"""What alone tells a pattern from matter about the axis that a volume lacks."""
+UNEVEN = "uneven light"
 FREE = "; of unseen frames free: "
 """A rival of light of each frame's own: the volume before it, whose prediction is allowed the same light."""
 WITHOUT = "; without matter"
@@ -186,13 +184,12 @@ def with_more(light: Light, hypothesis: str, seen: Scan, predict: Predict, optio
     in light of unknown flux. Smooth light is that of coarse pixels, on which it is compared: on finer ones, what passes
     for air may be matter."""
     frames = seen.measured
-    if hypothesis in (PATTERN, ODD_PATTERN):
+    if hypothesis == "fixed pattern":
         if len(seen) < 2:
             return None
         views = seen.views
         axis = 0.5 * (views.shape[1] - 1) - float((views.shifts[:, 0] / views.pixel_sizes).mean())
-        pattern, odd = fixed_pattern(light.evened(frames), predict(light), axis)
-        return replace(light, still=pattern if hypothesis == PATTERN else odd)
+        return replace(light, still=fixed_pattern(light.evened(frames), predict(light), axis))
     if hypothesis == "correlated noise":
         return replace(light, noise=NoiseModel.of_residuals(light.evened(frames), predict(light)))
     if hypothesis == FLUX:

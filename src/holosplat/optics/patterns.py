@@ -37,19 +37,19 @@ DARKEST = 0.01
 """Relative intensity below which a pixel counts as so bright: its logarithm has no meaning."""
 
 
-def fixed_pattern(frames: Tensor, predicted: Tensor, axis: float) -> tuple[Tensor, Tensor]:
-    """The pattern [H, W], float64, by frames [V, H, W] over those `predicted`, one where frames have nothing in common;
-    and its odd part, which no matter about the axis explains.
-
+def fixed_pattern(frames: Tensor, predicted: Tensor, axis: float) -> Tensor:
+    """The pattern [H, W], float64, by frames [V, H, W] over those `predicted`; one where frames have nothing in common.
     Pixels that are NaN have no weight. axis: the column of the rotation axis, counted from 0.
 
     The logarithms of frames over predictions are the pattern's and what each frame has alone, and a Wiener filter of
-    single pixels takes their mean for the pattern as far as chance allows. A pattern knows nothing of matter; errors
-    of the volume grow with its shadows, of which those of matter near the axis are alike in all frames. Of matter about
-    the axis they are even in the distance from it, while half of a pattern's power is odd. So the odd part o of the
-    mean gives the power c of the pattern beside v of chance (of a frame alone over V), apart from what goes with the
-    square of the shadow d that all frames have in common, `2 <o²> = c + v + s d²`; the even part e has an s of its own:
-    `p = o c / (c + v + s d²) + e c / (c + v + s' d²)`. Where no pixel has a mirror image, nothing tells them apart.
+    single pixels takes their mean for the pattern as far as chance allows. A pattern knows nothing of matter; errors of
+    the volume grow with its shadows, of which those of matter near the axis are alike in all frames. They are even in
+    the distance from the axis as far as that matter is, while half of a pattern's power is odd. So the odd part o of
+    the mean gives the power c of the pattern beside v of chance, that of a frame alone over V, apart from what goes
+    with the square of the shadow d that all frames have in common: `2 <o²> = c + v + s d²`. The even part e has at
+    least as much power, `2 <e²> = c' + s' d²`, of which c is the pattern's:
+    `p = o c / (c + v + s d²) + e c / (c' + s' d²)`. Where no pixel has a mirror image, nothing tells them apart, and
+    there is no pattern.
     """
     shadows = _logarithms(predicted)
     left, count = _logarithms(frames) - shadows, len(frames)
@@ -60,17 +60,16 @@ def fixed_pattern(frames: Tensor, predicted: Tensor, axis: float) -> tuple[Tenso
     columns = round(2 * axis) - torch.arange(mean.shape[1])
     inside = (columns >= 0) & (columns < mean.shape[1])
     if count < 2 or not inside.any():
-        return torch.ones_like(mean), torch.ones_like(mean)
+        return torch.ones_like(mean)
     odd, even = torch.zeros_like(mean), mean.clone()
     odd[:, inside] = 0.5 * (mean[:, inside] - mean[:, columns[inside]])
     even[:, inside] = 0.5 * (mean[:, inside] + mean[:, columns[inside]])
-    power, grows = _powers(2 * odd[:, inside].square().numpy(), shadow[:, inside].numpy())
-    common = max(power - chance, 0.0)
-    more = 2 * float(even[:, inside].square().mean()) - power
-    grows_even = max(more / max(float(shadow[:, inside].mean()), DARKEST**4), grows)
-    odd = common / (power + grows * shadow) * odd if common else torch.zeros_like(mean)
-    even = common / (power + grows_even * shadow) * even if common else torch.zeros_like(mean)
-    return (odd + even).exp(), odd.exp()
+    powers = [_powers(2 * part[:, inside].square().numpy(), shadow[:, inside].numpy()) for part in (odd, even)]
+    common = powers[0][0] - chance
+    if common <= 0:
+        return torch.ones_like(mean)
+    of_odd, of_even = (constant + slope * shadow for constant, slope in powers)
+    return (common * (odd / of_odd + even / of_even.maximum(of_odd))).exp()
 
 
 ROUNDS = 10
