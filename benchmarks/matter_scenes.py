@@ -51,6 +51,8 @@ PAGE = Path(__file__).resolve().parents[1] / "docs" / "data" / "matter_scenes.cs
 PIXEL, ENERGY, DISTANCE = 1e-6, 20.0, 0.1
 SIZES = {"small": (64, 8, 3000.0), "large": (96, 12, None)}
 """Pixels along an edge, views, and photons a pixel."""
+BARE = "shock, no bubble"
+"""A kind beside those of `MATTER`: a shock about nothing."""
 RUNS = ("Paganin, TV", "told", "nothing told", "wall told")
 TEXTBOOK = PerView("paganin", "tv")
 AROUND = 2
@@ -126,7 +128,8 @@ def wall_of(kind: Cuvette | Channel, substances: Substances) -> Wall:
 def planned(name: str, size: str, seed: int) -> tuple[FieldMatter, Substances, Drawn, Exposures]:
     """The kind of a scene, what is in that which `seed` gives, the scene, and how its frames are taken."""
     pixels, count, _ = SIZES[size]
-    kind = MATTER[name](MATTER[name].extent * pixels * PIXEL)
+    of, more = (MATTER["shock"], {"bubble": 0.0}) if name == BARE else (MATTER[name], {})
+    kind = of(of.extent * pixels * PIXEL, **more)
     substances = substances_of(kind)
     views = Views.evenly_spaced(count, shape=(pixels, pixels), pixel_size=PIXEL)
     exposures = Exposures.of(views, energy_kev=ENERGY, distance=DISTANCE)
@@ -204,7 +207,7 @@ def rows_of(path: Path) -> list[Row]:
 def main() -> None:
     """Make the rows that are not there yet, each written as soon as it is made, or print what is there."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kinds", nargs="+", choices=MATTER, default=list(MATTER))
+    parser.add_argument("--kinds", nargs="+", choices=(*MATTER, BARE), default=[*MATTER, BARE])
     parser.add_argument("--sizes", nargs="+", choices=SIZES, default=list(SIZES))
     parser.add_argument("--runs", nargs="+", choices=RUNS, default=list(RUNS))
     parser.add_argument("--seeds", nargs="+", type=int, default=[1])

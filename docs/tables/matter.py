@@ -4,8 +4,19 @@ from __future__ import annotations
 
 from .benchmark import Row, markdown, read, table
 
-KINDS = ["bubbles", "flotation", "cuvette", "jet", "break-up", "crack", "shock", "keyhole", "lattice", "fibres"]
-KINDS += ["channel", "star"]
+KINDS = [
+    "bubbles",
+    "flotation",
+    "cuvette",
+    "jet",
+    "break-up",
+    "crack",
+    "shock",
+    "shock, no bubble",
+    "keyhole",
+    "lattice",
+]
+KINDS += ["fibres", "channel", "star"]
 HEAD = {
     ("large", "told"): "12 views, no noise: told",
     ("small", "told"): "8 noisy views: told",
