@@ -21,7 +21,7 @@ def scenes() -> str:
     """Error of δ / Dice / total over the true one, of each kind and run: the scene of largest error."""
     rows = sorted(read("matter_scenes.csv"), key=lambda row: float(row["error"]))
     runs, lines = [run for run in HEAD if any((row["size"], row["run"]) == run for row in rows)], []
-    for kind in [one for kind in KINDS for one in (kind, *BESIDE.get(kind, []))]:
+    for kind in [one for each in KINDS for one in (each, *BESIDE.get(each, []))]:
         worst = {(row["size"], row["run"]): row for row in rows if row["kind"] == kind}
         if worst:
             lines.append([f"`{kind}`", *(_three(worst.get(run)) for run in runs)])
