@@ -88,7 +88,7 @@ def test_line_integrals_are_those_of_a_quadrature(source):
 def test_voxels_hold_the_profile_and_its_integral():
     grid = Grid.centred((27, 25, 23), PIXEL)
     unknowns = torch.tensor([11.2, 12.4, 13.1, 0.4, 1.0, -0.7, 0.2, 0.6, 0.0], dtype=torch.float64)
-    centre = np.array(grid.origin) + PIXEL * unknowns[:AXES].numpy()
+    centre = np.array(grid.origin) + PIXEL * unknowns[:AXES].flip(0).numpy()
     matter = SphericalMatter(centre, PIXEL, unknowns[AXES:], WATER)
     fine = matter.voxelise(Grid.centred((135, 125, 115), PIXEL / 5)).delta / WATER.delta
     assert Sphere.sum_of(unknowns) == pytest.approx(float(fine.sum()) / 125, rel=2e-3)
@@ -180,7 +180,7 @@ def test_radii_beyond_the_front_are_left_out(scan):
     assert 13 <= fit.resolved()["radii"] <= 18
     values = fit.voxels.values[0]
     z, y, x = np.indices(values.shape)
-    away = np.linalg.norm(np.stack([x, y, z]) - fit._sphere.unknowns[:AXES].numpy()[:, None, None, None], axis=0)
+    away = np.linalg.norm(np.stack([z, y, x]) - fit._sphere.unknowns[:AXES].numpy()[:, None, None, None], axis=0)
     assert not values[away > 19].any()
     assert values[away < 13].any()
 

@@ -139,10 +139,8 @@ class WhitenedFrames:
         return self._amplitudes.numel()
 
     def of_samples(self) -> WhitenedFrames:
-        """The same misfit of line integrals [V, H', W'] in pixels at the samples of the waves (`instrument.views`): as
-        fine as the first fringe needs."""
-        exposures, found = self.train.exposures, copy(self)
-        found.instrument = Instrument(exposures, fringe_sampling(exposures), backend=self.instrument.backend)
+        """The same misfit of line integrals [V, H', W'] in pixels at the samples of the waves (`instrument.views`)."""
+        found = copy(self)
         found._sampled = True
         return found
 

@@ -143,7 +143,7 @@ def _rings(radius: Tensor, n: int) -> Tensor:
 class Sphere:
     """The likeliest spherical matter, by Gauss and Newton's steps with damping (Levenberg 1944, Marquardt 1963).
 
-    Unknowns are the centre (x, y, z) in voxels of a pixel from the origin of their grid, and the values at the radii
+    Unknowns are the centre (z, y, x) in voxels of a pixel from the origin of their grid, and the values at the radii
     0, 1, … voxels below half the shorter side. So few unknowns need no prior: hundreds of pixels tell each of them. In
     a step those values are fixed at the bound `lower` that the gradient would keep there (Bertsekas 1982).
 
@@ -167,7 +167,7 @@ class Sphere:
         count, centre = max(1, min(start.shape) // 2), _symmetric_about(problem.backprojection(contrast).cpu())
         axes = [torch.arange(n, dtype=torch.float64) for n in start.shape]
         places = torch.stack(torch.meshgrid(*axes, indexing="ij"))
-        near = (places - centre.flip(0)[:, None, None, None]).norm(dim=0).round().long().clamp_max(count).flatten()
+        near = (places - centre[:, None, None, None]).norm(dim=0).round().long().clamp_max(count).flatten()
         sums, members = (torch.zeros(count + 1, dtype=torch.float64) for _ in range(2))
         sums.index_add_(0, near, start.double().cpu().flatten())
         members.index_add_(0, near, torch.ones_like(near, dtype=torch.float64))
@@ -180,7 +180,7 @@ class Sphere:
         """What the unknowns are of."""
         unknowns = self.unknowns if unknowns is None else unknowns
         edge = self.grid.voxel_size[0]
-        centre = np.array(self.grid.origin) + edge * unknowns[:AXES].numpy()
+        centre = np.array(self.grid.origin) + edge * unknowns[:AXES].flip(0).numpy()
         return SphericalMatter(centre, edge, unknowns[AXES:], self.frames.material)
 
     def step(self) -> None:
@@ -222,7 +222,8 @@ class Sphere:
         level = torch.ones_like(self.unknowns)
         level[AXES:] = float(self.unknowns[AXES:].abs().max()) or 1.0  # in smaller units rounding hides the slopes
         matter, views = self.matter(), self.frames.instrument.views
-        changes = [self._there(one) * float(unit) for one, unit in zip(matter.slopes(views), level)]
+        x, y, z, *values = matter.slopes(views)
+        changes = [self._there(one) * float(unit) for one, unit in zip((z, y, x, *values), level)]
         equations = self.frames.normal_equations(self._there(matter.lines(views)), changes)
         matrix, missing = (each.cpu() for each in equations)
         if self.told:
@@ -273,13 +274,13 @@ def _volumes(unknowns: Tensor) -> Tensor:
 
 
 def _symmetric_about(volume: Tensor) -> Tensor:
-    """The point (x, y, z), in half voxels, about which a volume is most nearly its own reflection: half of where its
+    """The point (z, y, x), in half voxels, about which a volume is most nearly its own reflection: half of where its
     convolution with itself is largest. What few views smear of a sphere is as symmetric as the sphere, and so are its
     fringes, which noise hides less than what is retrieved of them."""
     twice = [2 * n for n in volume.shape]
     convolved = torch.fft.irfftn(torch.fft.rfftn(volume, s=twice).square(), s=twice)
     index = np.unravel_index(int(convolved.argmax()), convolved.shape)
-    return 0.5 * torch.tensor([float(n) for n in index[::-1]], dtype=torch.float64)
+    return 0.5 * torch.tensor([float(n) for n in index], dtype=torch.float64)
 
 
 def likeliest_sphere(frames: WhitenedFrames, start: Tensor, lower: float) -> SphericalMatter:
@@ -324,7 +325,7 @@ class SphericalFit:
     def errors(self) -> tuple[float, ProfileErrors]:
         """Standard error of the total δ [m³], and those of centre and profile."""
         error, covariance = self._sphere.errors()
-        centre = covariance.diag()[:AXES].sqrt() * self._begun.grid.voxel_size[0]
+        centre = covariance.diag()[:AXES].sqrt().flip(0) * self._begun.grid.voxel_size[0]
         values = covariance[AXES:, AXES:] * self._begun.matter.delta**2
         spacing, unit = self._begun.grid.voxel_size[0], abs(self._unit)
         return error * unit, ProfileErrors(tuple(centre.tolist()), spacing, values.numpy())
