@@ -125,7 +125,7 @@ def test_a_total_is_told_of_spherical_matter_alone(scan):
 def test_a_sphere_that_has_left_the_field_ends(scan):
     """As in uneven light, which matter on one side cannot explain; a run ended in a singular matrix there."""
     sphere = sphere_of(scan, torch.zeros(SHAPE[1], *SHAPE))
-    sphere.unknowns[0] = 900.0
+    sphere.unknowns[1] = 900.0
     sphere.step()
     assert sphere.ended
     assert not sphere.matter().voxelise(sphere.grid).delta.any()

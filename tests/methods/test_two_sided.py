@@ -259,7 +259,7 @@ def test_frames_are_left_alone_where_both_sides_explain_them_as_well(bodies, mon
 def test_light_that_is_uneven_stays_beside_bodies(bodies):
     """Matter on both sides does not explain what light does."""
     rows, columns = np.mgrid[-1 : 1 : SHAPE[0] * 1j, -1 : 1 : SHAPE[1] * 1j]
-    pattern = 1 + 0.05 * np.sin(9 * rows + 2) * np.cos(7 * columns)
+    pattern = 1 + 0.05 * np.sin(9 * rows + 2) * np.cos(7 * columns + 1)
     lit = replace(bodies, frames=(bodies.frames * pattern).astype(np.float32))
     first = first_of_task(Task(lit, MaterialPrior.of_ratio(1500).signed(1)))
     first.taken, _ = decided(first, LightOptions(), (), ("fixed pattern",))
