@@ -217,7 +217,7 @@ def test_where_clean_frames_had_no_first_surfaces_gaussians_that_lack_matter_giv
 
 @pytest.mark.usefixtures("nothing_missing")
 @pytest.mark.parametrize("there", [True, False])
-def test_a_resumed_run_of_clean_frames_makes_its_first_benchmark_anew(there, monkeypatch):
+def test_a_resumed_run_of_clean_frames_makes_its_first_surfaces_anew(there, monkeypatch):
     def near(stage: BodiesStage, task: Task, surfaces: SurfaceOptions) -> None:
         stage.poor[:] = [(task.scan, mesh_of(4) if there else None)]
 
