@@ -25,6 +25,7 @@ from holosplat.scan import Exposures, Scan
 from holosplat.series.plan import prior_of
 from holosplat.specimens import Substances
 from holosplat.specimens.continuous import ContinuousScene, Soft, ellipsoid
+from holosplat_bench.specimens.fluids import Shock
 from holosplat_bench.specimens.gas_waves import ExpandingShock
 
 WATER = DeltaBeta(5.75e-7, 2.56e-10)
@@ -123,7 +124,8 @@ def test_a_total_is_told_of_spherical_matter_alone(scan):
 
 
 def test_a_sphere_that_has_left_the_field_ends(scan):
-    """As in uneven light, which matter on one side cannot explain; a run ended in a singular matrix there."""
+    """As in uneven light, which matter on one side cannot explain; a run ended in a singular matrix there. Above all
+    frames, for far along one view's beam it would still cast its shadow there."""
     sphere = sphere_of(scan, torch.zeros(SHAPE[1], *SHAPE))
     sphere.unknowns[1] = 900.0
     sphere.step()
@@ -199,6 +201,15 @@ def test_what_other_matter_predicts_better_from_the_same_views_is_refuted(scan, 
         assert _refuted({SPHERICAL: sphere, BELOW: first, BOTH: two}, PLAIN, ()) is refuted
     monkeypatch.setattr(contrast, "_refuted", lambda *_: True)
     assert decide_sides(first_of_task(Task(scan, prior)), PLAIN)[1].choice != SPHERICAL
+
+
+def test_a_sharp_front_without_noise_is_not_refuted():
+    """A free volume may explain what samples leave of a front; lines of voxels left more than that."""
+    views = Views.evenly_spaced(12, (96, 96), 1e-6)
+    shock = Shock(76.8e-6, bubble=0.0).drawn(Substances(WATER, medium=WATER), 103).scene
+    scan = hs.simulate(shock, Exposures.of(views, 20.0, 0.1), seed=5, is_test=np.zeros(12, dtype=bool))
+    first = first_of_task(Task(scan, MaterialPrior.of_ratio(WATER.ratio)))
+    assert decide_sides(first, PLAIN)[1].choice == SPHERICAL
 
 
 @pytest.mark.parametrize("angles", [(0.0, 60.0, 120.0), (0.0, 90.0), (0.0,)], ids=["3 views", "2 views", "1 view"])

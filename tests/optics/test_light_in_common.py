@@ -75,6 +75,20 @@ def test_what_is_even_about_the_axis_is_no_evidence_of_a_pattern(axis: float):
     assert float((found / true).log()[:, clear].std()) < 0.4 * float(true.log()[:, clear].std())
 
 
+@pytest.mark.parametrize("pattern", [0.0, 0.01])
+def test_errors_about_the_axis_that_no_shadow_tells_are_left_in_the_frames(pattern: float):
+    """Rings all over the frame, where no matter was predicted: none is taken, or little beside a true pattern."""
+    x, y = torch.arange(SHAPE[1]).double() - AXIS, torch.arange(SHAPE[0]).double()[:, None]
+    rings = torch.cos(1.3 * x.abs() + 0.4 * y)
+    *_, true = frames(pattern=pattern)
+    own = 1 + NOISE * torch.from_numpy(np.random.default_rng(5).standard_normal((12, *SHAPE)))
+    found = fixed_pattern((0.02 * rings).exp() * own * true, torch.ones_like(own), AXIS).log()
+    share = float((found * rings).sum() / rings.square().sum())
+    assert abs(share) < 0.4 * 0.02
+    if not pattern:
+        assert float(found.std()) < 0.5 * NOISE
+
+
 def test_without_mirror_images_nothing_tells_a_pattern_from_matter():
     measured, matter, *_ = frames(pattern=0.01)
     assert bool((fixed_pattern(measured, matter, -30.0) == 1).all())
