@@ -5,11 +5,11 @@
 
 Scenes are those of `family_scenes`, in turn of every simulated family, on pixels joined 2 × 2 (23 to 30 of them along
 an edge), of 2 to 16 views, reconstructed by linear retrieval, by retrieval of all views with total variation, as a
-smooth volume, or as `reconstruct` does by default, which takes ten times as long and has an eighth of the scenes. A run's
-errors against the truth stand beside what its rehearsals say of them. The map of matter of each run is compared with
-the true matter, too (docs/data/matter_map.csv): its probabilities come from rehearsals alone, which no truth enters.
-Every fourth scene is also run with a mistake in
-the metadata: then only the residual over that of the rehearsals counts.
+smooth volume, or as `reconstruct` does by default, which takes ten times as long and has an eighth of the scenes. A
+run's errors against the truth stand beside what its rehearsals say of them. The map of matter of each run is compared
+with the true matter, too (docs/data/matter_map.csv): its probabilities come from rehearsals alone, which no truth
+enters. Every fourth scene is also run with a mistake in the metadata: then only the residual over that of the
+rehearsals counts.
 
 Factors are those of all scenes; the coverage of a family is that by factors of all other families. Frames are simulated
 with rays through meshes, or closed forms, on a raster several times finer than that of any fit.
