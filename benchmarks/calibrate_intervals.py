@@ -68,26 +68,27 @@ COLUMNS += ("facts", "seconds", "machine", "commit")
 Mistake = Callable[[Scan, hs.MaterialPrior, np.random.Generator], tuple[Scan, hs.MaterialPrior]]
 
 
-def _posed(scan: Scan, rotations: np.ndarray, shifts: np.ndarray | None = None) -> Scan:
+def posed(scan: Scan, rotations: np.ndarray, shifts: np.ndarray | None = None) -> Scan:
+    """`scan` with other poses of its views."""
     views = replace(scan.views, rotations=rotations, shifts=scan.views.shifts if shifts is None else shifts)
     return replace(scan, exposures=replace(scan.exposures, views=views))
 
 
 def shuffled(scan: Scan, prior: hs.MaterialPrior, rng: np.random.Generator) -> tuple[Scan, hs.MaterialPrior]:
     """Angles in another order."""
-    return _posed(scan, scan.views.rotations[rng.permutation(len(scan))]), prior
+    return posed(scan, scan.views.rotations[rng.permutation(len(scan))]), prior
 
 
 def halved(scan: Scan, prior: hs.MaterialPrior, rng: np.random.Generator) -> tuple[Scan, hs.MaterialPrior]:
     """Half the angles."""
     angles = np.unwrap(np.arctan2(scan.views.rotations[:, 0, 2], scan.views.rotations[:, 0, 0]))
-    return _posed(scan, rotation_y(np.rad2deg(0.5 * angles))), prior
+    return posed(scan, rotation_y(np.rad2deg(0.5 * angles))), prior
 
 
 def off_axis(scan: Scan, prior: hs.MaterialPrior, rng: np.random.Generator) -> tuple[Scan, hs.MaterialPrior]:
     """An axis of rotation 2 to 4 pixels elsewhere."""
     by = rng.choice([-1, 1]) * rng.uniform(2, 4) * scan.views.finest
-    return _posed(scan, scan.views.rotations, scan.views.shifts + np.array([by, 0.0])), prior
+    return posed(scan, scan.views.rotations, scan.views.shifts + np.array([by, 0.0])), prior
 
 
 def other_sign(scan: Scan, prior: hs.MaterialPrior, rng: np.random.Generator) -> tuple[Scan, hs.MaterialPrior]:
