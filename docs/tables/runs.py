@@ -84,15 +84,12 @@ def _fields(method: str, commit: str) -> str:
     return "\n".join(script("tune_fields").table(rows, method))
 
 
-@table("verdicts", "python benchmarks/verdicts.py", "ten minutes", "verdicts.csv")
+@table("verdicts", "python benchmarks/verdicts.py, and again with --summary", "an hour", "verdict_words.csv")
 def verdicts() -> str:
-    """Right and wrong runs."""
-    lines = []
-    for row in read("verdicts.csv"):
-        numbers = [row[n] or "–" for n in ("error", "total", "over_contrast", "over_noise", "over_allowed")]
-        lines.append([row["case"], *numbers, "explained" if row["good"] == "True" else "not explained"])
-    head = ("run", "error of δ", "total δ over the true", "residual over contrast", "over noise")
-    return markdown((*head, "over what is allowed", "verdict"), lines)
+    """What the verdict says of right and wrong runs."""
+    names = ("mistake", "result", "runs", "consistent", "limited", "called wrong", "cause named")
+    lines = [[row[name] or "–" for name in names] for row in read("verdict_words.csv")]
+    return markdown(names, lines)
 
 
 @table("imaging-chain", "python docs/figures.py imaging-chain WORK", "ten minutes", "imaging_chain.csv")

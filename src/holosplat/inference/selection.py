@@ -194,15 +194,15 @@ def select(
 ) -> Decision:
     """The candidate that predicts unseen frames best, by the policy of `Compared.wins`.
 
-    candidates: the null first, then from simple to complex; score: of a candidate on the unseen frames of a fold, kept
-    by the caller; folds: how many there are. Folds are looked at one after another, as long as those before leave the
-    candidate open: it may win by them, and has not won early. The frames, and not their blocks, give the standard error
-    over several folds: frames differ by more than their parts do. After k of K folds a candidate wins early if its gain
-    is of practical size even less √(K/k) times as many errors as count in the end (O'Brien & Fleming 1979), and more by
-    Student's t, for few frames do not tell their own scatter; both frames and blocks must say so. by: how unseen frames came about; beside: other names that a
-    candidate must win against, too. surely, least: whether a gain must be sure, and the practical size that it must
-    have. Where another score has told that it is sure, its size is enough; where another has told its size (`least` is
-    0), it need only be sure.
+    candidates: the null first, then from simple to complex; score: of a candidate on the unseen frames of a fold,
+    kept by the caller; folds: how many there are. Folds are looked at one after another, as long as those before
+    leave the candidate open: it may win by them, and has not won early. The frames, and not their blocks, give the
+    standard error over several folds: frames differ by more than their parts do. After k of K folds a candidate wins
+    early if its gain is of practical size even less √(K/k) times as many errors as count in the end (O'Brien &
+    Fleming 1979), and more by Student's t, for few frames do not tell their own scatter; both frames and blocks must
+    say so. by: how unseen frames came about; beside: other names that a candidate must win against, too. surely,
+    least: whether a gain must be sure, and the practical size that it must have. Where another score has told that it
+    is sure, its size is enough; where another has told its size (`least` is 0), it need only be sure.
     """
     require(len(candidates) > 0, "a selection needs at least one candidate, but there is none.")
     began, best, compared = time.perf_counter(), candidates[0], list[Compared]()
