@@ -33,7 +33,8 @@ DAMPED, EASED, MOST_DAMPED = 1e-3, 10.0, 1e6
 """Damping at first, as a share of each second derivative; the factor by which it falls after a step that helped and
 grows after one that did not; and the one at which the fit ends, for then no step helps."""
 WORTH = 0.5
-"""Gain of the log-likelihood below which a step is the last: by so much one of the unknowns moves it on average."""
+"""Gain of the log-likelihood below which a step is the last: by so much one of the unknowns moves it on average. Where
+the sphere leaves more than noise, that is in units of what it leaves (quasi-likelihood: McCullagh & Nelder 1989)."""
 MOST = 30
 """Steps at most; Gauss and Newton's take about eight."""
 
@@ -201,10 +202,11 @@ class Sphere:
             self.damping *= 1 / EASED if value < self.value else EASED
             if value < self.value:
                 gained, self.unknowns, self.value, self.done = self.value - value, tried, value, self.done + 1
-        if gained < WORTH and not self.cut:
+        last = gained < WORTH * max(1.0, 2 * self.value / self.frames.measured.numel())
+        if last and not self.cut:
             self._cut(matrix + LEAST * diagonal, self.unknowns / level)
         else:
-            self.ended = gained < WORTH or self.done >= MOST
+            self.ended = last or self.done >= MOST
 
     def errors(self) -> tuple[float, Tensor]:
         """Standard error of the sum of the volume, and covariance of the unknowns, of which no value is unknown beyond
