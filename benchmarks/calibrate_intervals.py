@@ -110,12 +110,16 @@ def rows_of(number: int) -> Iterator[dict[str, Any]]:
     rng, began = np.random.default_rng([SEED, number]), time.perf_counter()
     name = list(SIMULATED)[number % len(SIMULATED)]
     views, way = int(rng.choice(VIEWS)), str(rng.choice(WAYS))
-    made = replace(SIMULATED[name], views=(views,)).scene(SEED + number, name)
+    shared = {"scene": number, "family": name, "method": way, "views": views, "mistake": ""}
+    shared |= {"machine": machine(), "commit": commit()}
+    try:
+        made = replace(SIMULATED[name], views=(views,)).scene(SEED + number, name)
+    except hs.InputError as refusal:  # its bodies find no place
+        yield shared | {"good": f"refused: {refusal}"}
+        return
     scan = made.scan.binned(2)
     assert made.matter is not None
-    truth = made.matter.voxelise(hs.Grid.of_views(scan.views))
-    shared = {"scene": number, "family": name, "method": way, "views": views, "facts": made.facts}
-    shared |= {"machine": machine(), "commit": commit()}
+    truth, shared = made.matter.voxelise(hs.Grid.of_views(scan.views)), shared | {"facts": made.facts}
     mistakes = ["", str(rng.choice(list(MISTAKES)))] if number % 4 == 3 else [""]
     for mistake in mistakes:
         told, prior = MISTAKES[mistake](scan, made.prior, rng) if mistake else (scan, made.prior)
