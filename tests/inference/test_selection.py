@@ -133,7 +133,7 @@ def test_a_gain_of_little_more_than_practical_size_does_not_win_early():
     """A sure gain of .028 in two frames of a fold, whose error is .0004, may be less than .0202 over all: it is here,
     for the second fold gains nothing."""
     gains = ((0.0284, 0.0276), (0.004, 0.004))
-    assert 0.028 > 13.97 * math.sqrt(2) * 0.0004
+    assert 13.97 * math.sqrt(2) * 0.0004 < 0.028
     assert 0.028 - 13.97 * math.sqrt(2) * 0.0004 < -math.log1p(-MARGIN)
 
     def score(name, fold):

@@ -10,8 +10,10 @@ import pytest
 
 import holosplat as hs
 from holosplat.checks import InputError
+from holosplat.inference import Decision
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import METHODS
+from holosplat.methods.uncertain import Determined
 from holosplat.optics.background import LightOptions
 from holosplat.tables import paths
 from holosplat.workflows import certainty
@@ -77,6 +79,62 @@ def test_mistakes_are_found_on_held_out_frames_and_none_where_there_is_none(monk
     other = MaterialPrior.known(DeltaBeta(-WATER.delta, -WATER.beta))
     assert compare_causes(scan, replace(again, prior=other)).choice == "sign"
     assert compare_causes(scan[np.arange(3)], again).choice == NULL
+
+
+@pytest.mark.usefixtures("unjudged_runs")
+@pytest.mark.parametrize("pixels", [3.0, -3.0, 0.0])
+def test_an_axis_elsewhere_is_named(pixels, monkeypatch):
+    names = ("axis to the left", "axis to the right")
+    monkeypatch.setattr(certainty, "MISTAKES", {name: MISTAKES[name] for name in names})
+    told = moved(scan_of(12), pixels)
+    again = done_by("paganin-tv", told)
+    found = compare_causes(told, again, drawn_frames(again.done, told, told.exposures, 0))
+    assert found.choice == ("shift_x" if pixels else NULL)
+
+
+def moved(scan: hs.Scan, pixels: float) -> hs.Scan:
+    views = replace(scan.views, shifts=scan.views.shifts + np.array([pixels * PIXEL, 0.0]))
+    return replace(scan, exposures=replace(scan.exposures, views=views))
+
+
+@pytest.mark.usefixtures("unjudged_runs")
+@pytest.mark.parametrize("told", [True, False])
+def test_what_frames_do_not_tell_is_not_tried(told, monkeypatch):
+    class Asked(Again):
+        def __call__(self, scan, further=0, uncertain=None, **changed):
+            found = super().__call__(scan, further, **changed)
+            value = Determined("distance", 0.03, 0.01, 0.09, (0.01, 0.09), told)
+            return replace(found, constants=(value,) if uncertain else ())
+
+    monkeypatch.setattr(certainty, "MISTAKES", {"distance": MISTAKES["distance"]})
+    scan = scan_of(12)
+    found = compare_causes(scan, done_by("paganin-tv", scan, kind=Asked))
+    assert [each.name for each in found.compared] == ["distance"] * told
+
+
+@pytest.mark.usefixtures("unjudged_runs")
+@pytest.mark.parametrize(
+    ("held_out", "parts"), [(False, {(3, 7), (2, 6), (1, 5), (0, 4)}), (True, {(3, 7)})], ids=["none", "a quarter"]
+)
+def test_frames_are_held_out_in_turn_where_a_run_has_none(held_out, parts, monkeypatch):
+    aside = set()
+
+    class Seen(Again):
+        def __call__(self, scan, further=0, **changed):
+            aside.add(tuple(np.flatnonzero(scan.is_test)))
+            return super().__call__(scan, further, **changed)
+
+    def select(name, candidates, score, folds, by):
+        assert folds == len(parts)
+        [score(each, fold) for each in candidates for fold in range(folds)]
+        return Decision(name, NULL, by)
+
+    monkeypatch.setattr(certainty, "MISTAKES", {"other sign of δ": MISTAKES["other sign of δ"]})
+    monkeypatch.setattr(certainty, "select", select)
+    scan = scan_of(8)
+    scan = scan if held_out else replace(scan, is_test=np.zeros(8, dtype=bool))
+    compare_causes(scan, done_by("paganin-tv", scan, kind=Seen))
+    assert aside == parts
 
 
 class Long(Again):

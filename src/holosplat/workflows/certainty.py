@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -17,7 +18,7 @@ from ..align import find_axis
 from ..beamline.simulate import Simulation, simulated_frames
 from ..checks import InputError, require
 from ..geometry import Grid, rotation_y
-from ..inference import Compared, Decision, Score, select
+from ..inference import Decision, Score, select
 from ..matter import DeltaBeta, MaterialPrior
 from ..methods import Method, Uncertain
 from ..methods.cross_validation import predicted_frames
@@ -28,7 +29,7 @@ from ..optics.background import LightOptions
 from ..optics.noise import NoiseModel
 from ..progress import Progress
 from ..rotations import angles_about_y
-from ..scan import Exposures, Scan, interleaved_split
+from ..scan import Exposures, Scan
 from ..tables import overridden, paths, read_table
 from ..volume import Volume
 from .evaluate import of_absorption
@@ -190,9 +191,11 @@ NULL = "metadata as given"
 """The candidate that leaves scan and prior alone."""
 NAME, BY = "mistake in the metadata", "held-out frames"
 FEWEST = 4
-"""Frames of which one can be held out."""
+"""Frames of which one can be held out, and parts of which one is."""
 RANGE = 3.0
 """Factor by which a distance or δ/β may be larger or smaller than given."""
+AWAY = 2.0
+"""Pixels by which the axis is tried elsewhere: one that is wrong by more than half of that comes nearer."""
 
 
 Change = Callable[[Scan, Again], tuple[Scan, Mapping[str, Any]]]
@@ -226,6 +229,18 @@ def _turned(angles: Callable[[np.ndarray], np.ndarray]) -> Change:
     return change
 
 
+def _beside(pixels: float) -> Change:
+    """An axis of rotation elsewhere, which `find_axis` may not tell in few views."""
+
+    def change(scan: Scan, again: Again) -> tuple[Scan, Mapping[str, Any]]:
+        views = scan.views
+        require(views.shares_axis, "views without a common axis have none that is elsewhere.")
+        shifts = views.shifts + np.array([pixels * views.finest, 0.0])
+        return replace(scan, exposures=replace(scan.exposures, views=replace(views, shifts=shifts))), {}
+
+    return change
+
+
 def _spread(scan: Scan, again: Again) -> tuple[Scan, Mapping[str, Any]]:
     return scan, {"uncertain": Uncertain(distance=_about(float(np.median(scan.exposures.distance))))}
 
@@ -255,6 +270,8 @@ def _steps(turn: float) -> Change:
 
 MISTAKES: Mapping[str, tuple[str, Change]] = {
     "axis of rotation": ("shift_x", _axis),
+    "axis to the left": ("shift_x", _beside(-AWAY)),
+    "axis to the right": ("shift_x", _beside(AWAY)),
     "other sign of δ": ("sign", _other_sign),
     "angles in reverse order": ("angles", _turned(lambda angles: angles[::-1])),
     "angles in radians": ("angles", _turned(lambda angles: np.rad2deg(angles))),
@@ -278,42 +295,44 @@ def compare_causes(
 
     rehearsed: the same frames, simulated of the result; there the metadata are right, so that what predicts better
     there, too, mends the method, and is no mistake
-    Without held-out frames, every fourth one is held out. Another sense of rotation is none of the mistakes: the
-    mirrored object gives the same frames. The choice is a key of `STEPS`, or the null.
+    Without held-out frames, a quarter of them is held out, as often as it takes. Another sense of rotation is none of
+    the mistakes: the mirrored object gives the same frames. The choice is a key of `STEPS`, or the null.
     """
     if len(scan) < FEWEST:
         return Decision(NAME, NULL, f"fewer than {FEWEST} frames, of which none can be held out")
-    keys = {name: key for name, (key, _) in MISTAKES.items()} | {NULL: NULL}
-    order, score = list(MISTAKES), _unseen(scan, again)
-    scores = [score] if rehearsed is None else [score, _unseen(rehearsed, again)]
-    possible, mends = [NULL], list[str]()
-    for number, name in enumerate(order):
-        on_progress(f"cause: {name}", number / len(order))
-        try:
-            gains = (of(name).gain_over(of(NULL)) for of in scores)
-            if all(Compared(name, *gain).wins for gain in gains) and rehearsed is not None:
-                mends.append(name)
-                continue
-        except InputError:  # this mistake cannot have been made here
-            continue
-        possible.append(name)
-    by = BY + (f"; in rehearsals, too: {', '.join(mends)}" if mends else "")
-    decision = select(NAME, possible, lambda name, fold: score(name), by=by)
-    return replace(decision, choice=keys[decision.choice])
+    folds = 1 if scan.is_test.any() else FEWEST
+    score, possible, mends = _unseen(scan, again), [NULL], list[str]()
+    for number, name in enumerate(MISTAKES):
+        on_progress(f"cause: {name}", number / len(MISTAKES))
+        with suppress(InputError):  # this mistake cannot have been made here
+            score(name, 0)
+            possible.append(name)
+    mended = None if rehearsed is None else _unseen(rehearsed, again)
+    while True:
+        by = BY + (f"; in rehearsals, too: {', '.join(mends)}" if mends else "")
+        decision = select(NAME, possible, score, folds, by=by)
+        taken = decision.choice
+        if taken == NULL or mended is None or select(NAME, (NULL, taken), mended, folds, by=BY).choice == NULL:
+            return replace(decision, choice=NULL if taken == NULL else MISTAKES[taken][0])
+        possible.remove(taken)
+        mends.append(taken)
 
 
-def _unseen(scan: Scan, again: Again) -> Callable[[str], Score]:
-    """What reconstructions of a scan leave of its held-out frames, with the mistake of a name put right."""
-    scan = scan if scan.is_test.any() else replace(scan, is_test=interleaved_split(len(scan)))
+def _unseen(scan: Scan, again: Again) -> Callable[[str, int], Score]:
+    """What reconstructions of a scan leave of its held-out frames, or of a quarter of its frames, with the mistake of a
+    name put right."""
 
     @cache
-    def score(name: str) -> Score:
-        changed, how = (scan, {}) if name == NULL else MISTAKES[name][1](scan, again)
+    def score(name: str, fold: int) -> Score:
+        aside = scan.is_test if scan.is_test.any() else (np.arange(len(scan)) + fold) % FEWEST == FEWEST - 1
+        split = replace(scan, is_test=aside)
+        changed, how = (split, {}) if name == NULL else MISTAKES[name][1](split, again)
         found = again(changed, **how)
+        require("uncertain" not in how or all(each.told for each in found.constants), "frames do not tell it.")
         placed = found.placed(changed)
         lit, test = light_of(placed, found.light, found.still), placed.test()
         predicted = predicted_frames(test.exposures, found.object, found.oversample)
-        lamp = 1.0 if lit is None else lit.factor()[torch.from_numpy(scan.is_test)].to(predicted)
+        lamp = 1.0 if lit is None else lit.factor()[torch.from_numpy(aside)].to(predicted)
         return Score.of(test.left(predicted * lamp))
 
     return score
