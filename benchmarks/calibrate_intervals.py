@@ -44,6 +44,7 @@ from holosplat.workflows.certainty import (
     LEVEL,
     SIGNED,
     SIZES,
+    Factor,
     errors_of,
     scale_of,
 )
@@ -179,8 +180,8 @@ def reliability() -> None:
 
 
 def columns_of(rows: Sequence[dict[str, Any]], name: str) -> np.ndarray:
-    """Errors and scales of a quantity, [2, N]."""
-    return np.array([[float(row[f"{name}_{what}"]) for row in rows] for what in ("error", "scale")])
+    """Errors, scales and excesses of a quantity, [3, N]."""
+    return np.array([[float(row[each]) for row in rows] for each in (f"{name}_error", f"{name}_scale", "excess")])
 
 
 def conformal_quantile(scores: np.ndarray, level: float) -> float:
@@ -190,19 +191,27 @@ def conformal_quantile(scores: np.ndarray, level: float) -> float:
     return float(np.sort(scores)[rank - 1]) if rank <= len(scores) else math.inf
 
 
-def fitted_factor(errors: np.ndarray, scales: np.ndarray) -> tuple[float, float]:
-    """The floor and the factor of a quantity by its errors [N] and its scales [N] in N scenes.
+def fitted_factor(errors: np.ndarray, scales: np.ndarray, excess: np.ndarray) -> Factor:
+    """What makes the intervals of a quantity by its errors [N], its scales [N] and the excess [N] of N scenes.
 
-    Each floor, of the scales that there are, makes intervals that cover `LEVEL` of the scenes: that of the least mean
-    logarithm of the length is taken (efficiency; Vovk et al. 2016, COPA). Of so few scenes that there is no quantile,
-    the factor is the largest score; then the level is n/(n + 1).
+    Each floor, of the scales that there are, makes intervals that cover `LEVEL` of the scenes, whether scales count
+    times the excess or not: what has the least mean logarithm of the length is taken (efficiency; Vovk et al. 2016,
+    COPA). Of so few scenes that there is no quantile, the factor is the largest score; then the level is n/(n + 1).
     """
-    sizes, found = np.abs(errors), list[tuple[float, float, float]]()
-    for floor in np.unique(scales[scales > 0]):
-        scores = sizes / (scales + floor)
-        factor = min(conformal_quantile(scores, LEVEL), float(scores.max()))
-        found.append((float(np.log(factor * (scales + floor)).mean()), float(floor), factor))
-    return min(found)[1:]
+    sizes, found = np.abs(errors), list[tuple[float, Factor]]()
+    for power in (0, 1):
+        grown = scales * np.maximum(1.0, excess) ** power
+        for floor in np.unique(grown[grown > 0]):
+            scores = sizes / (grown + floor)
+            factor = min(conformal_quantile(scores, LEVEL), float(scores.max()))
+            length = float(np.log(factor * (grown + floor)).mean())
+            found.append((length, Factor(float(floor), factor, len(errors), power)))
+    return min(found, key=lambda each: each[0])[1]
+
+
+def covered(of: Factor, rows: Sequence[dict[str, Any]], name: str) -> list[bool]:
+    """Whether the intervals of a quantity hold the truth of each row."""
+    return [bool(abs(error) <= of.reach(scale, excess)) for error, scale, excess in columns_of(rows, name).T]
 
 
 def summary() -> None:
@@ -215,19 +224,18 @@ def summary() -> None:
     lines = list[dict[str, str]]()
     families = sorted({row["family"] for row in right})
     for name in NUMBERS:
-        floor, factor = fitted_factor(*columns_of(right, name))
-        parts.append(f"[{name}]\nfloor = {floor:.4g}\nfactor = {factor:.4g}\nscenes = {len(right)}\n")
+        of = fitted_factor(*columns_of(right, name))
+        numbers = {"floor": f"{of.floor:.4g}", "factor": f"{of.factor:.4g}", "scenes": of.scenes, "power": of.power}
+        parts.append("".join([f"[{name}]\n", *(f"{key} = {value}\n" for key, value in numbers.items())]))
         inside = dict[str, list[bool]]()
         for family in families:
             others = [row for row in right if row["family"] != family]
             own = [row for row in right if row["family"] == family]
-            own_floor, own_factor = fitted_factor(*columns_of(others, name))
-            error, scale = columns_of(own, name)
-            inside[family] = (np.abs(error) <= own_factor * (scale + own_floor)).tolist()
+            inside[family] = covered(fitted_factor(*columns_of(others, name)), own, name)
         every = [one for each in inside.values() for one in each]
         for family, each in {"all": every, **inside}.items():
-            lines.append(_line(name, family, len(each), sum(each), factor))
-        print(f"{name}: factor {factor:.2f}, floor {floor:.3g}, {sum(every)} of {len(every)} covered", flush=True)
+            lines.append(_line(name, family, len(each), sum(each), of.factor))
+        print(f"{name}: {of}, {sum(every)} of {len(every)} covered", flush=True)
     parts.append(f"[{RESIDUAL}]\nfloor = 0.0\nfactor = {limit:.4g}\nscenes = {len(right)}\n")
     for mistake in ("", *MISTAKES):
         some = [row for row in rows if row["mistake"] == mistake]

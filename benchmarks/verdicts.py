@@ -36,7 +36,8 @@ from holosplat.metrics import volume_scores
 from holosplat.model import smooth_modes
 from holosplat.rotations import angles_about_y
 from holosplat.scan import Scan
-from holosplat.workflows.rehearsal import rehearse
+from holosplat.workflows.certainty import NULL, factors
+from holosplat.workflows.rehearsal import RESIDUAL, rehearse
 
 DATA = Path(__file__).resolve().parents[1] / "docs" / "data"
 PAGE, WORDS = DATA / "verdicts.csv", DATA / "verdict_words.csv"
@@ -134,6 +135,11 @@ def is_wrong(row: dict[str, str]) -> bool:
     return float(row["error"]) > HARMLESS * float(row["best"])
 
 
+def is_called_wrong(row: dict[str, str]) -> bool:
+    """Whether a cause was named, or the excess passes the package's limit as it is now."""
+    return row["named"] not in ("", NULL) or float(row["excess"]) > factors()[RESIDUAL].factor
+
+
 def summary() -> None:
     """Write how many runs had each word, right and wrong ones, and how often the cause was named; and print it."""
     rows = [row for row in read(PAGE) if row["error"]]
@@ -142,11 +148,12 @@ def summary() -> None:
         for wrong in (False, True):
             some = [row for row in rows if row["mistake"] == mistake and is_wrong(row) == wrong]
             if some:
-                words = {word: str(sum(row["word"] == word for row in some)) for word in ("consistent", "limited")}
-                called = [row for row in some if row["word"] == "wrong"]
+                called = [row for row in some if is_called_wrong(row)]
+                consistent = sum(row["word"] == "consistent" for row in some if row not in called)
                 named = sum(row["named"] == row["cause"] for row in called) if mistake else ""
                 line = {"mistake": mistake or "none", "result": "wrong" if wrong else "right", "runs": str(len(some))}
-                lines.append({**line, **words, "called wrong": str(len(called)), "cause named": str(named)})
+                line |= {"consistent": str(consistent), "limited": str(len(some) - len(called) - consistent)}
+                lines.append({**line, "called wrong": str(len(called)), "cause named": str(named)})
                 print(lines[-1])
     write(lines, WORDS)
 

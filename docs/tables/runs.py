@@ -433,8 +433,11 @@ def intervals() -> str:
     for name in dict.fromkeys(row["quantity"] for row in rows):
         own = [row for row in rows if row["quantity"] == name]
         every, parts = own[0], [int(row["covered"]) / int(row["scenes"]) for row in own[1:]]
-        lines.append([name, every["factor"], every["scenes"], every["covered"], str(len(parts)), f"{min(parts):.2f}"])
-    return markdown(("error of", "factor", "scenes", "covered", "families", "least coverage of a family"), lines)
+        share = f"{int(every['covered']) / int(every['scenes']):.3f}"
+        enough = f"{sum(part >= 0.8 for part in parts)} of {len(parts)}"
+        lines.append([name, every["factor"], every["scenes"], share, enough, f"{min(parts):.2f}"])
+    head = ("error of", "factor", "scenes", "covered", "families covered to 0.8 and more", "least of a family")
+    return markdown(head, lines)
 
 
 @table("mistakes", CALIBRATED, "a night", "interval_coverage.csv")

@@ -283,10 +283,22 @@ def test_the_floor_is_that_of_the_shortest_intervals_and_they_cover_scenes_that_
     for _ in range(300):
         scales = np.exp(rng.choice([-4.0, 0.0], 60, p=[0.4, 0.6]) + 0.3 * rng.normal(size=60))
         errors = scales * rng.normal(size=60)
-        floor, factor = fitted_factor(errors[:-20], scales[:-20])
-        reach = factor * (scales[-20:] + floor)
+        of = fitted_factor(errors[:-20], scales[:-20], np.ones(40))
+        reach = np.array([of.reach(scale, 1.0) for scale in scales[-20:]])
         inside.extend(np.abs(errors[-20:]) <= reach)
         short.append(reach[scales[-20:] < 0.1].mean())
     assert np.mean(inside) == pytest.approx(0.9, abs=0.02)
     assert np.mean(short) < 0.15
-    assert fitted_factor(np.array([0.0, 2.0]), np.array([0.0, 1.0])) == (1.0, 1.0)
+    of = fitted_factor(np.array([0.0, 2.0]), np.array([0.0, 1.0]), np.ones(2))
+    assert (of.floor, of.factor, of.scenes, of.power) == (1.0, 1.0, 2, 0)
+
+
+def test_scales_count_times_the_excess_where_errors_grow_with_it(scripts):
+    fitted_factor, rng = scripts["calibrate_intervals"].fitted_factor, np.random.default_rng(1)
+    scales, excess = np.exp(rng.normal(size=200)), np.exp(np.abs(rng.normal(size=200)))
+    errors = scales * rng.normal(size=200)
+    assert fitted_factor(excess * errors, scales, excess).power == 1
+    plain = fitted_factor(errors, scales, excess)
+    assert plain.power == 0
+    assert plain.reach(2.0, 3.0) == plain.reach(2.0, 1.0) == pytest.approx(plain.factor * (2.0 + plain.floor))
+    assert fitted_factor(excess * errors, scales, excess).reach(2.0, 0.5) < plain.reach(1e3, 1.0)

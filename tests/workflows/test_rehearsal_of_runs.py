@@ -191,7 +191,8 @@ def test_intervals_hold_what_rehearsals_take_for_true(few):
     doubted = replace(shown, doubts={"total": 3.0})
     assert doubted.interval("total")[1] > certainty.factors()["total"].factor * 3.0
     assert doubted.interval("delta") == shown.interval("delta")
-    assert Rehearsal.from_dict(doubted.as_dict()).interval("total") == doubted.interval("total")
+    again = Rehearsal.from_dict(doubted.as_dict())  # a verdict's powers are written with four digits
+    assert again.interval("total") == pytest.approx(doubted.interval("total"), rel=1e-3)
     assert "m³ or more in size" in "".join(replace(doubted, total=1e-22).intervals())
 
 

@@ -50,12 +50,18 @@ class Factor:
     """How a quantity of rehearsals becomes an interval that holds the truth in `LEVEL` of the calibration's scenes.
 
     floor: added to the scale of a run, for one near 0 promises too much (Papadopoulos et al. 2008, normalised
-    nonconformity); factor: of the sum of both
+    nonconformity); factor: of the sum of both; power: 1 if the scale counts times the excess, else 0: what rehearsals
+    do not show leaves more in the frames than they do
     """
 
     floor: float
     factor: float
     scenes: int
+    power: int = 0
+
+    def reach(self, scale: float, excess: float) -> float:
+        """How far an interval goes, by the scale of a run and its excess."""
+        return self.factor * (scale * max(1.0, excess) ** self.power + self.floor)
 
 
 @cache

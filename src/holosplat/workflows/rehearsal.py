@@ -127,8 +127,8 @@ class Rehearsal:
 
     def interval(self, name: str) -> tuple[float, float]:
         """Ends of the interval of a quantity's error; that of a size begins at 0."""
-        of, scale = factors()[name], scale_of(name, self.values(name))
-        reach = of.factor * (max(scale, self.doubts.get(name, 0.0)) + of.floor)
+        scale = max(scale_of(name, self.values(name)), self.doubts.get(name, 0.0))
+        reach = factors()[name].reach(scale, self.excess[0])
         return 0.0 if name in SIZES else -reach, reach
 
     @property
