@@ -113,6 +113,28 @@ def test_what_frames_do_not_tell_is_not_tried(told, monkeypatch):
 
 
 @pytest.mark.usefixtures("unjudged_runs")
+@pytest.mark.parametrize("refused", ["a fold", "all folds", "the null"])
+def test_reconstructions_that_are_refused_decide_nothing(refused, monkeypatch):
+    """A mistake that cannot be put right in one part of the frames is compared in the others; frames in which nothing
+    is found are no fault of the command."""
+
+    class Refusing(Again):
+        def __call__(self, scan, further=0, right=False, **changed):
+            first = bool(scan.is_test[3])
+            if right and (refused == "all folds" or (refused == "a fold" and not first)):
+                raise InputError("no.")
+            if not right and refused == "the null":
+                raise InputError("the start found no matter.")
+            return super().__call__(scan, further, **changed)
+
+    monkeypatch.setattr(certainty, "MISTAKES", {"light": ("light", lambda scan, again: (scan, {"right": True}))})
+    scan = replace(scan_of(8), is_test=np.zeros(8, dtype=bool))
+    found = compare_causes(scan, done_by("paganin-tv", scan, kind=Refusing))
+    assert found.choice == ("light" if refused == "the null" else NULL)
+    assert len(found.compared) == (refused != "all folds")
+
+
+@pytest.mark.usefixtures("unjudged_runs")
 @pytest.mark.parametrize(
     ("held_out", "parts"), [(False, {(3, 7), (2, 6), (1, 5), (0, 4)}), (True, {(3, 7)})], ids=["none", "a quarter"]
 )

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -310,8 +309,7 @@ def compare_causes(
     score, possible, mends = _unseen(scan, again), [NULL], list[str]()
     for number, name in enumerate(MISTAKES):
         on_progress(f"cause: {name}", number / len(MISTAKES))
-        with suppress(InputError):  # this mistake cannot have been made here
-            score(name, 0)
+        if score(name, 0) is not score(NULL, 0):
             possible.append(name)
     mended = None if rehearsed is None else _unseen(rehearsed, again)
     while True:
@@ -326,15 +324,18 @@ def compare_causes(
 
 def _unseen(scan: Scan, again: Again) -> Callable[[str, int], Score]:
     """What reconstructions of a scan leave of its held-out frames, or of a quarter of its frames, with the mistake of a
-    name put right."""
+    name put right; the same as the null where this mistake cannot have been made, and all where there is no matter."""
 
     @cache
     def score(name: str, fold: int) -> Score:
         aside = scan.is_test if scan.is_test.any() else (np.arange(len(scan)) + fold) % FEWEST == FEWEST - 1
         split = replace(scan, is_test=aside)
-        changed, how = (split, {}) if name == NULL else MISTAKES[name][1](split, again)
-        found = again(changed, **how)
-        require("uncertain" not in how or all(each.told for each in found.constants), "frames do not tell it.")
+        try:
+            changed, how = (split, {}) if name == NULL else MISTAKES[name][1](split, again)
+            found = again(changed, **how)
+            require("uncertain" not in how or all(each.told for each in found.constants), "frames do not tell it.")
+        except InputError:
+            return score(NULL, fold) if name != NULL else Score.of(split.test().measured.nan_to_num(1.0) - 1)
         placed = found.placed(changed)
         lit, test = light_of(placed, found.light, found.still), placed.test()
         predicted = predicted_frames(test.exposures, found.object, found.oversample)
