@@ -101,7 +101,7 @@ def test_two_materials_and_free_channels_have_a_total(scan):
     ):
         said = Prediction(VoxelGrid(values, grid, matter), scan.train().exposures, 2)
         found = total_of_run(said, scan.train(), Task(scan.train(), MaterialPrior.of_ratio(CELL.ratio)))
-        assert found.value == pytest.approx(true.sum() * np.prod(grid.voxel_size), rel=0.05, abs=0)
+        assert found.value == pytest.approx(true.sum() * np.prod(grid.voxel_size), rel=0.06, abs=0)
 
 
 def test_an_empty_volume_is_said_to_be_empty(scan):
