@@ -17,7 +17,7 @@ from holosplat.methods import METHODS, SmoothVolume, Task, contrast
 from holosplat.methods.contrast import BELOW, BOTH, SPHERICAL, _refuted, both_sides, decide_sides, with_sign
 from holosplat.methods.illumination import prepared
 from holosplat.methods.method import first_of_task
-from holosplat.methods.spherical import AXES, Sphere, SphericalFit, SphericalMatter
+from holosplat.methods.spherical import AXES, WORTH, Sphere, SphericalFit, SphericalMatter
 from holosplat.methods.volume import SmoothStage
 from holosplat.optics.background import LightOptions
 from holosplat.optics.noise import NoiseModel
@@ -131,6 +131,21 @@ def test_a_sphere_that_has_left_the_field_ends(scan):
     sphere.step()
     assert sphere.ended
     assert not sphere.matter().voxelise(sphere.grid).delta.any()
+
+
+def test_steps_of_what_is_no_sphere_end_by_what_they_leave(monkeypatch):
+    """Cells leave far more than noise, and so much is gained on the way that the gain alone would not end the steps."""
+    cells = hs.specimens.random_cells(3, (30e-6, 20e-6, 30e-6), 3, 9e-6)
+    sphere = sphere_of(of(hs.MeshScene.of_one_material(cells, WATER)), torch.zeros(SHAPE[1], *SHAPE))
+    values, cut = [sphere.value], Sphere._cut
+    monkeypatch.setattr(Sphere, "_cut", lambda self, *how: values.append(self.value) or cut(self, *how))
+    while not sphere.cut:
+        values = [sphere.value]
+        sphere.step()
+    before, after = values
+    left = 2 * after / sphere.frames.measured.numel()
+    assert left > 2
+    assert WORTH < before - after < WORTH * left
 
 
 def test_a_shock_is_found_in_three_beams(scan, shock):

@@ -311,6 +311,17 @@ def test_the_three_words(monkeypatch):
     assert not made(1.0, 0.5, 1.0, True).doubtful
 
 
+@pytest.mark.parametrize(("power", "times"), [(0, 1.0), (1, 3.0)])
+def test_an_interval_grows_with_the_excess_where_the_calibration_says_so(power, times, monkeypatch):
+    """A residual three times that of rehearsals; one that is less makes no interval shorter."""
+    monkeypatch.setattr(rehearsal, "factors", lambda: {"total": Factor(0.5, 2.0, 99, power)})
+    for own, grown in ((3.0, times), (0.3, 1.0)):
+        shown = made(own, 1.0, 1.0, False)
+        shown = replace(shown, runs=tuple({**run, "total": 0.1} for run in shown.runs))
+        reach = 2.0 * (0.1 * grown + 0.5)
+        assert shown.interval("total") == (pytest.approx(-reach), pytest.approx(reach))
+
+
 def test_rehearsals_are_kept_and_only_those_that_are_missing_are_made(tmp_path, monkeypatch):
     scan, method, folder = scan_of(4), METHODS["ctf-tv"], RunFolder(tmp_path / "run")
     done = hs.reconstruct(scan, PRIOR, method, folder=folder)

@@ -10,12 +10,13 @@ import pytest
 import torch
 
 from helpers.contact import contact_scan
-from helpers.runs import CELL, KNOWN, SMALL, scene
+from helpers.runs import CELL, KNOWN, PIXEL, SHAPE, SMALL, scene
 from holosplat.baselines import HolographicTV
+from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
 from holosplat.fit.problem import Schedule
 from holosplat.fit.residuals import Prediction
-from holosplat.geometry import Grid
+from holosplat.geometry import Grid, Views
 from holosplat.matter import MaterialPrior, Matter
 from holosplat.methods import (
     HolographicVoxels,
@@ -33,6 +34,7 @@ from holosplat.methods.uncertain import Determined
 from holosplat.report.content import ReportContent
 from holosplat.report.page import score_tables
 from holosplat.representations import VoxelGrid
+from holosplat.scan import Exposures
 from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
 from holosplat.workflows.run_folder import RunFolder
 from holosplat.workflows.totals import MOST_VIEWS, TotalMatter, in_words, total_of_run
@@ -89,8 +91,10 @@ def test_one_row_and_strong_absorbers_have_a_total():
     assert np.isfinite([found.total.value, found.total.error]).all()
 
 
-def test_two_materials_and_free_channels_have_a_total(scan):
-    """Their own model says what they predict, for no single ratio is theirs."""
+def test_two_materials_and_free_channels_have_a_total():
+    """Their own model says what they predict, for no single ratio is theirs. Eleven views: of eight the total is 5 %
+    too large, a little more or less by processor."""
+    scan = simulate(scene(), Exposures.of(Views.evenly_spaced(11, SHAPE, PIXEL), 20.0, 0.1))
     grid = Grid.of_views(scan.views)
     true = np.asarray(scene().voxelise(grid).delta, dtype=np.float64)
     occupancy = torch.from_numpy(true / CELL.delta).float()
@@ -101,7 +105,7 @@ def test_two_materials_and_free_channels_have_a_total(scan):
     ):
         said = Prediction(VoxelGrid(values, grid, matter), scan.train().exposures, 2)
         found = total_of_run(said, scan.train(), Task(scan.train(), MaterialPrior.of_ratio(CELL.ratio)))
-        assert found.value == pytest.approx(true.sum() * np.prod(grid.voxel_size), rel=0.06, abs=0)
+        assert found.value == pytest.approx(true.sum() * np.prod(grid.voxel_size), rel=0.05, abs=0)
 
 
 def test_an_empty_volume_is_said_to_be_empty(scan):

@@ -335,7 +335,7 @@ def _unseen(scan: Scan, again: Again) -> Callable[[str, int], Score]:
             found = again(changed, **how)
             require("uncertain" not in how or all(each.told for each in found.constants), "frames do not tell it.")
         except InputError:
-            return score(NULL, fold) if name != NULL else Score.of(split.test().measured.nan_to_num(1.0) - 1)
+            return score(NULL, fold) if name != NULL else Score.of(split.test().left(torch.ones(())))
         placed = found.placed(changed)
         lit, test = light_of(placed, found.light, found.still), placed.test()
         predicted = predicted_frames(test.exposures, found.object, found.oversample)
