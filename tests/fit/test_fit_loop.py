@@ -43,6 +43,20 @@ def test_the_loss_falls_and_held_out_frames_are_predicted_better(scan):
     assert not fit.stopped_early
 
 
+def test_rows_beyond_the_frames_do_not_weaken_what_bounds_the_volume(scan):
+    """Means over a volume that is taller than the frames hold fewer voxels of matter beside those of air."""
+    found = list[dict[str, float]]()
+    for rows in (0, scan.views.shape[0]):
+        cloud = a_cloud()
+        cloud.raw_amplitudes += 3  # so that the occupancy exceeds one somewhere
+        cloud.raw_amplitudes[0] = -20
+        cloud.centres[0, 1] = 0.5 * scan.views.shape[0] + rows - 1
+        weights = Objective(tv_volume=0.02, overfull=3.0, two_levels=0.5)
+        found.append(next(iter(run(fit_of(scan, objective=weights, cloud=cloud, steps=1)))))
+    for name in ("tv_volume", "overfull"):
+        assert found[1][name] == pytest.approx(found[0][name], rel=0.05)  # tails that end with the frames
+
+
 def test_a_loss_is_the_weighted_sum_of_its_recorded_terms(scan):
     """Weights, the linear FRC ramp, and volume terms made up for the steps they are left out of."""
     image = {"l1": 0.7, "l2_amplitude": 0.5, "ssim": 0.2, "tv_image": 0.05, "frc": 0.3, "frc_ramp": 0.5}

@@ -224,7 +224,8 @@ def gaussian_plan(
     backend, schedule = resolve(options.backend), options.schedule
     base = ground(scan, cloud.on(backend), cloud.matter, options.objective, schedule, backend, light=light)
     grid = Grid.of_views(field_of(cloud, scan.views))
-    terms = [base.frames, *_object_terms(base, options, grid, cloud.matter), *base.extra(options.terms)]
+    depth = grid.shape[0] * grid.shape[1] / Grid.of_views(scan.views).shape[1]
+    terms = [base.frames, *_object_terms(base, options, grid, depth, cloud.matter), *base.extra(options.terms)]
     plan = Plan(
         problem=Problem(base.model, tuple(terms)),
         schedule=schedule,
@@ -237,12 +238,12 @@ def gaussian_plan(
     return plan, base.train
 
 
-def _object_terms(base: Ground, options: FitOptions, grid: Grid, matter: Matter) -> list[Term]:
+def _object_terms(base: Ground, options: FitOptions, grid: Grid, depth: float, matter: Matter) -> list[Term]:
     w, terms = options.objective, list[Term]()
     if w.anisotropy > 0:
         terms.append(Anisotropy(w.anisotropy, w.anisotropy_limit))
     if w.uses_volume:
         block = grid.block((0, 0, 0), block_shape(grid, options.schedule))
         noise = noise_share(base.train.measured)
-        terms.append(VolumeTerm(w, block, grid.shape[0], len(base.train), noise, matter.occupancies))
+        terms.append(VolumeTerm(w, block, depth, len(base.train), noise, matter.occupancies))
     return terms

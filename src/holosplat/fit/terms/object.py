@@ -32,9 +32,10 @@ class VolumeTerm:
     bounded: whether an occupancy of one means something, so that more of it, or less, can be wrong.
     """
 
-    def __init__(self, objective: Objective, block: Grid, depth: int, views: int, noise: float, bounded: bool) -> None:
-        """block: shape and pitch of what a step looks at; depth: voxels of the whole volume along the beam; noise: the
-        share of the frames' contrast that is noise."""
+    def __init__(self, objective: Objective, block: Grid, depth: float, views: int, noise: float, bounded: bool) -> None:
+        """block: shape and pitch of what a step looks at; depth: voxels of the whole volume for each pixel of a frame,
+        for means over more rows than frames have would weigh less; noise: the share of the frames' contrast that is
+        noise."""
         self._block = (block.shape, block.voxel_size[0])
         self._scale = depth / DEPTH * math.sqrt(VIEWS / views)
         levels = objective.two_levels * (1 + objective.noise_gain * noise)
