@@ -32,7 +32,9 @@ class VolumeTerm:
     bounded: whether an occupancy of one means something, so that more of it, or less, can be wrong.
     """
 
-    def __init__(self, objective: Objective, block: Grid, depth: float, views: int, noise: float, bounded: bool) -> None:
+    def __init__(
+        self, objective: Objective, block: Grid, depth: float, views: int, noise: float, bounded: bool
+    ) -> None:
         """block: shape and pitch of what a step looks at; depth: voxels of the whole volume for each pixel of a frame,
         for means over more rows than frames have would weigh less; noise: the share of the frames' contrast that is
         noise."""
