@@ -224,8 +224,7 @@ def gaussian_plan(
     backend, schedule = resolve(options.backend), options.schedule
     base = ground(scan, cloud.on(backend), cloud.matter, options.objective, schedule, backend, light=light)
     grid = Grid.of_views(field_of(cloud, scan.views))
-    depth = grid.shape[0] * grid.shape[1] / Grid.of_views(scan.views).shape[1]
-    terms = [base.frames, *_object_terms(base, options, grid, depth, cloud.matter), *base.extra(options.terms)]
+    terms = [base.frames, *_object_terms(base, options, grid, cloud.matter), *base.extra(options.terms)]
     plan = Plan(
         problem=Problem(base.model, tuple(terms)),
         schedule=schedule,
@@ -238,12 +237,13 @@ def gaussian_plan(
     return plan, base.train
 
 
-def _object_terms(base: Ground, options: FitOptions, grid: Grid, depth: float, matter: Matter) -> list[Term]:
+def _object_terms(base: Ground, options: FitOptions, grid: Grid, matter: Matter) -> list[Term]:
     w, terms = options.objective, list[Term]()
     if w.anisotropy > 0:
         terms.append(Anisotropy(w.anisotropy, w.anisotropy_limit))
     if w.uses_volume:
         block = grid.block((0, 0, 0), block_shape(grid, options.schedule))
         noise = noise_share(base.train.measured)
+        depth = grid.shape[0] * grid.shape[1] / Grid.of_views(base.train.views).shape[1]
         terms.append(VolumeTerm(w, block, depth, len(base.train), noise, matter.occupancies))
     return terms

@@ -35,8 +35,8 @@ class VolumeTerm:
     def __init__(
         self, objective: Objective, block: Grid, depth: float, views: int, noise: float, bounded: bool
     ) -> None:
-        """block: shape and pitch of what a step looks at; depth: voxels of the whole volume for each pixel of a frame,
-        for means over more rows than frames have would weigh less; noise: the share of the frames' contrast that is
+        """block: shape and pitch of what a step looks at; depth: voxels of the whole volume for each pixel of a frame
+        (means over more rows than frames have would weigh less); noise: the share of the frames' contrast that is
         noise."""
         self._block = (block.shape, block.voxel_size[0])
         self._scale = depth / DEPTH * math.sqrt(VIEWS / views)
