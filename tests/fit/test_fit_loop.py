@@ -45,14 +45,16 @@ def test_the_loss_falls_and_held_out_frames_are_predicted_better(scan):
 
 def test_rows_beyond_the_frames_do_not_weaken_what_bounds_the_volume(scan):
     """Means over a volume that is taller than the frames hold fewer voxels of matter beside those of air."""
-    found = list[dict[str, float]]()
+    found, heights = list[dict[str, float]](), list[int]()
     for rows in (0, scan.views.shape[0]):
         cloud = a_cloud()
         cloud.raw_amplitudes += 3  # so that the occupancy exceeds one somewhere
         cloud.raw_amplitudes[0] = -20
         cloud.centres[0, 1] = 0.5 * scan.views.shape[0] + rows - 1
-        weights = Objective(tv_volume=0.02, overfull=3.0, two_levels=0.5)
-        found.append(next(iter(run(fit_of(scan, objective=weights, cloud=cloud, steps=1)))))
+        fit = fit_of(scan, objective=Objective(tv_volume=0.02, overfull=3.0), cloud=cloud, steps=1)
+        heights.append(fit.plan.grid.shape[1])
+        found.append(next(iter(run(fit))))
+    assert heights == [20, 60]
     for name in ("tv_volume", "overfull"):
         assert found[1][name] == pytest.approx(found[0][name], rel=0.05)  # tails that end with the frames
 
