@@ -60,12 +60,15 @@ def decide_matter(task: Task, methods: Mapping[MatterKind, Method] | None = None
     known = methods is None or bool(task.prior.materials)
     candidates = (*levels, CONTINUOUS) if known else (CONTINUOUS, *levels)
     if methods is None or not blind(task.decisions):
-        found = select(NAME, candidates, flat.score, first.folds.count, by=first.folds.by)
-        sure = found.choice != CONTINUOUS or (not known and all(each.loses for each in found.compared))
+        how = flat.score, first.folds.count
+        found = select(NAME, candidates, *how, by=first.folds.by)
+        sure = found.choice != CONTINUOUS or (
+            not known and select(NAME, (*levels, CONTINUOUS), *how, by=first.folds.by).choice == CONTINUOUS
+        )
         if methods is None or sure:
             return found
     for effort in (EFFORT, 1.0):
-        kinds: dict[MatterKind, Method] = {kind: one.with_effort(effort) for kind, one in methods.items()}
+        kinds: dict[MatterKind, Method] = {**methods, "levels": methods["levels"].with_effort(effort)}
         fits = TrialFits(task, first, kinds, whole=effort == 1.0)
 
         def scored(name: str, fold: int, fits: TrialFits = fits) -> Score:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import OrderedDict
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -17,6 +18,7 @@ from ..checks import require
 from ..display import of_object
 from ..geometry import Grid, Poses, Views
 from ..matter import Matter
+from ..optics.resampling import refined
 from ..projectors.voxels import LatticeProjector, RayProjector, SliceProjector
 from ..volume import LineIntegrals, Unmoved, Volume
 
@@ -38,6 +40,10 @@ class VoxelLines:
     one leaves on rotated rasters. Voxels larger than the pixels asked for are interpolated to their size first. Cones:
     a ray to every pixel (`RayProjector`).
 
+    Matter on voxels has nothing finer than these. On pixels about the y axis that are so many times smaller, the lines
+    are those of pixels as large as a voxel, band-limited between them (`optics.resampling.refined`): strips of a part
+    of a voxel would show the steps between voxels, which light behind strong matter turns into fringes.
+
     `Poses` are unknown where gradients of their rotations or shifts are asked for. They are taken as they are now: make
     new lines when they change. They always go through the lattice, be they about the y axis or not, because strip
     integrals cannot say what a turn out of the axis does; values there differ from the strips' by the ripple.
@@ -49,7 +55,10 @@ class VoxelLines:
         if known.sources is not None:
             self._lines = RayProjector(grid, known, backend).lines
         elif isinstance(known, Views) and known.shares_axis:
-            self._lines = _AboutAxis(grid, known, backend)
+            factor, (h, w) = _finer(grid, known), known.shape
+            larger = replace(known, shape=(h // factor, w // factor), pitch=factor * known.pitch)
+            strips = _AboutAxis(grid, larger, backend)
+            self._lines = lambda values: refined(strips(values), factor)
         else:
             self._lines = _AnyPose(grid, known, backend)
 
@@ -58,6 +67,13 @@ class VoxelLines:
         shape = tuple(values.shape[1:])
         require(shape == self.grid.shape, f"values must lie on the grid {self.grid.shape}, but on {shape}.")
         return torch.stack([self._lines(channel.float()) for channel in values], dim=1)
+
+
+def _finer(grid: Grid, views: Views) -> int:
+    """Pixels along the edge of the smallest voxel, at most as many as make rows and columns of whole voxels."""
+    h, w = views.shape
+    most = math.floor(min(grid.voxel_size) / views.finest + 1 - SAME)
+    return max((n for n in range(2, most + 1) if h % n == w % n == 0), default=1)
 
 
 class _AboutAxis:
