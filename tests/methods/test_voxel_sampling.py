@@ -1,4 +1,4 @@
-"""Waves behind voxels: too many samples show the edges of voxels as fringes."""
+"""Waves behind voxels: how finely they are sampled, and what voxels cast on such samples."""
 
 from __future__ import annotations
 
@@ -21,25 +21,28 @@ from holosplat.specimens.phantoms import packed_balls
 from holosplat.specimens.scene import MeshScene
 
 
-@pytest.mark.parametrize("refine", [1, 2])
-def test_true_voxels_of_sharp_matter_predict_frames_better_with_two_samples_a_pixel(refine):
-    """Fringes of half a pixel ask for four samples of sharp matter; those of voxels show the voxels' edges."""
+@pytest.mark.parametrize(("refine", "samples"), [(1, 2), (1, 4), (2, 4)])
+def test_true_voxels_of_sharp_matter_predict_frames_better_than_their_steps(refine, samples):
+    """As the same matter on voxels as small as the samples, each of which has the value of the large one around it."""
     pixel, water = 5e-6, parse_material("water").delta_beta(20.0)
     views = Views.evenly_spaced(3, (31, 42), pixel)
     exposures = Exposures.of(views, 20.0, 0.1)
     balls = packed_balls(pixel * np.array([9.0, 7.0, 12.0]), (31 * pixel,) * 3, seed=4)
     scene = MeshScene.of_one_material([ball.mesh() for ball in balls], water)
     frames = torch.from_numpy(simulate(scene, exposures).frames)
-    grid = Grid.of_views(views, refine)
-    occupied = torch.from_numpy(scene.voxelise(grid).delta / water.delta).float()
-    voxels = VoxelGrid(occupied[None], grid, Matter.one(*water))
+    grid, factor = Grid.of_views(views, refine), samples // refine
+    occupied = torch.from_numpy(scene.voxelise(grid).delta / water.delta).float()[None]
+    smooth = VoxelGrid(occupied, grid, Matter.one(*water))
+    for axis in (1, 2, 3):
+        occupied = occupied.repeat_interleave(factor, axis)
+    steps = VoxelGrid(occupied, grid.divided((factor,) * 3), Matter.one(*water))
 
-    def missed(samples: int) -> float:
-        return float((predicted_frames(exposures, voxels, samples) - frames).square().mean().sqrt())
+    def missed(voxels: VoxelGrid, number: int) -> float:
+        return float((predicted_frames(exposures, voxels, number) - frames).square().mean().sqrt())
 
     assert fringe_sampling(exposures) == 4
-    assert missed(0) == missed(2)
-    assert missed(2) < 0.9 * missed(4)
+    assert missed(smooth, 0) == missed(smooth, 2)
+    assert missed(smooth, samples) < 0.7 * missed(steps, samples)
 
 
 def test_waves_behind_larger_voxels_have_samples_as_fine_as_behind_those_of_a_pixel():

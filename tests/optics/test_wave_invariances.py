@@ -20,7 +20,7 @@ from holosplat.optics.propagation import (
     fresnel_transfer,
     gaussian_factors,
 )
-from holosplat.optics.resampling import Resampling
+from holosplat.optics.resampling import Resampling, refined
 from holosplat.optics.sampling import smooth_margin
 from holosplat.units import wavelength, wavenumber
 
@@ -185,6 +185,27 @@ def test_an_image_turned_over_gives_the_frame_turned_over(frames, image, share):
 def test_binning_keeps_the_mean(image, factor):
     fine = torch.from_numpy(np.kron(image, np.ones((factor, factor))))[None]
     assert torch.allclose(bin_pixels(fine, factor)[0], torch.from_numpy(image), rtol=0, atol=1e-12)
+
+
+@given(images(least=1, most=8), st.integers(1, 4))
+def test_finer_pixels_keep_the_means_of_coarse_ones(image, factor):
+    fine = refined(torch.from_numpy(image), factor)
+    assert torch.allclose(bin_pixels(fine[None], factor)[0], torch.from_numpy(image), rtol=0, atol=1e-12)
+
+
+@given(st.integers(0, 4), st.integers(0, 6), st.integers(1, 4))
+def test_finer_pixels_show_a_cosine_as_it_is(down, across, factor):
+    """Means over pixels of cosines with nodes at the edges of a field of 5 × 7 pixels."""
+
+    def means(finer: int) -> Tensor:
+        parts = []
+        for order, count in ((down, 5), (across, 7)):
+            edges = torch.linspace(0, count, count * finer + 1, dtype=torch.float64)
+            k = np.pi * order / count
+            parts.append(torch.sin(k * edges).diff() / k * finer if order else torch.ones(count * finer))
+        return parts[0][:, None] * parts[1]
+
+    assert torch.allclose(refined(means(1).double(), factor), means(factor).double(), rtol=0, atol=1e-12)
 
 
 @given(images(least=4), numbers(0.3, 3.0), numbers(-2.0, 2.0), numbers(-2.0, 2.0))

@@ -59,7 +59,7 @@ def refined(images: Tensor, factor: int) -> Tensor:
 
 @lru_cache(maxsize=8)
 def _finer(count: int, factor: int) -> Tensor:
-    return torch.from_numpy(cosine_series(count, count * factor, 1 / factor, sharper=True)).float()
+    return torch.from_numpy(cosine_series(count, count * factor, 1 / factor, sharper=True))
 
 
 def cosine_series(count: int, target: int, ratio: float, sharper: bool = False) -> np.ndarray:
