@@ -24,6 +24,7 @@ ABOVE, BELOW = "δ above the medium's", "δ below the medium's"
 BOTH = "δ on both sides of the medium's"
 BY_FITTED = "fitted frames"
 SPHERICAL, BALL = f"spherical matter, {BOTH}", "spherical matter on one side of the medium"
+LONGER = "matter on one side of the medium, by as many steps"
 
 
 Scoring = Callable[[FirstVolumes, int, str], Score]
@@ -75,7 +76,8 @@ def decide_sides(
 
     Light makes up for matter that may not be there, and both sides for light. So both sides must predict unseen frames
     better than one, under the light that is `told` alone, and no worse than one in the light that was taken beside it:
-    where these are alike, the frames are left alone. Spherical matter, which has the fewest unknowns, is asked for
+    where these are alike, the frames are left alone. No bound ends their volumes sooner, so that these have more steps
+    than first volumes; nor may they win by these alone. Spherical matter, which has the fewest unknowns, is asked for
     before any on both sides, and must predict more than a sphere on one side. What predicts unseen views by its few
     unknowns may yet leave much of those that it was fitted to, so it is refuted where other matter predicts the same
     views better, their noise apart (data fission). spherical: whether it is asked for, as methods that have it do. Of
@@ -83,7 +85,7 @@ def decide_sides(
     """
     first.on_progress(STAGE, 0.0)
     one = ABOVE if first.prior.delta_sign > 0 else BELOW
-    two = both_sides(first)
+    two = _with_usual_steps(first, first.prior.on_both_sides())
     lit, single = f"{one} in {name_of(first.taken)}", Trials(first, light)
     spheres, ball = (
         replace(two, prior=each.prior.about_a_point(), _material=each.material, _made={}) for each in (two, first)
@@ -95,7 +97,8 @@ def decide_sides(
         del trials[SPHERICAL]
     if first.folds.by == BY_FISSION:
         del trials[BOTH]
-    rivals = {BALL: (Trials(ball, light), told)}
+    longer = _with_usual_steps(first, first.prior)
+    rivals = {BALL: (Trials(ball, light), told), LONGER: (Trials(longer, light), told)}
 
     def scored(name: str, fold: int) -> Score:
         side, without, _ = name.partition(WITHOUT)
@@ -105,7 +108,7 @@ def decide_sides(
         except InputError:  # there is no such matter
             return without_matter(first, fold)
 
-    beside, by = {SPHERICAL: (SPHERICAL + WITHOUT, BALL), BOTH: (BOTH + WITHOUT,)}, first.folds.by
+    beside, by = {SPHERICAL: (SPHERICAL + WITHOUT, BALL), BOTH: (BOTH + WITHOUT, LONGER)}, first.folds.by
     decision = select(STAGE, tuple(trials), scored, first.folds.count, by=by, beside=beside)
     if decision.choice == SPHERICAL and _refuted({SPHERICAL: spheres, one: first, BOTH: two}, light, told):
         return decide_sides(first, light, told, spherical=False)
@@ -130,13 +133,12 @@ def _refuted(volumes: Mapping[str, FirstVolumes], light: LightOptions, told: Hyp
     return select(STAGE, tuple(volumes), scored, by=BY_FISSION).choice != null
 
 
-def both_sides(first: FirstVolumes) -> FirstVolumes:
-    """The same, of the same δ/β, of matter on both sides of its medium, with the usual steps, for no bound makes them
-    end sooner."""
+def _with_usual_steps(first: FirstVolumes, prior: MaterialPrior) -> FirstVolumes:
+    """The same, of the same δ/β, of matter as `prior` says, with the usual steps."""
     usual = HolographicTV()
     how = replace(first.options, retrieval=usual.retrieval, iterations=usual.iterations)
-    both = FirstVolumes(first.folds, first.prior.on_both_sides(), first.on_progress, how)
-    return both if both.prior.fixes_ratio else both.at_ratio(first.material.ratio)
+    found = FirstVolumes(first.folds, prior, first.on_progress, how)
+    return found if prior.fixes_ratio else found.at_ratio(first.material.ratio)
 
 
 def with_sign(prior: MaterialPrior, decisions: Sequence[Decision]) -> MaterialPrior:
