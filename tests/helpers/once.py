@@ -22,7 +22,16 @@ from holosplat.geometry import Grid
 from holosplat.inference import Decision
 from holosplat.matter import DeltaBeta
 from holosplat.methods import Task
-from holosplat.methods.contrast import BELOW, BOTH, SPHERICAL, Scoring, both_sides, decide_sides, decide_sign, with_sign
+from holosplat.methods.contrast import (
+    BELOW,
+    BOTH,
+    SPHERICAL,
+    Scoring,
+    decide_sides,
+    decide_sign,
+    with_sign,
+    with_usual_steps,
+)
 from holosplat.methods.cross_validation import FirstVolumes, unseen_ratio
 from holosplat.methods.illumination import decided
 from holosplat.methods.levels import decide_matter
@@ -99,7 +108,7 @@ def once(memory: Once) -> Iterator[None]:
         made = memory.answer(key, compute, first.on_progress)
         if made.choice not in (BOTH, SPHERICAL):
             return first, made
-        two = both_sides(first)
+        two = with_usual_steps(first, first.prior.on_both_sides())
         return FirstVolumes(two.folds, with_sign(two.prior, (made,)), two.on_progress, two.options), made
 
     def ratio(first: FirstVolumes) -> tuple[float, Decision]:

@@ -85,7 +85,7 @@ def decide_sides(
     """
     first.on_progress(STAGE, 0.0)
     one = ABOVE if first.prior.delta_sign > 0 else BELOW
-    two = _with_usual_steps(first, first.prior.on_both_sides())
+    two = with_usual_steps(first, first.prior.on_both_sides())
     lit, single = f"{one} in {name_of(first.taken)}", Trials(first, light)
     spheres, ball = (
         replace(two, prior=each.prior.about_a_point(), _material=each.material, _made={}) for each in (two, first)
@@ -97,7 +97,7 @@ def decide_sides(
         del trials[SPHERICAL]
     if first.folds.by == BY_FISSION:
         del trials[BOTH]
-    longer = _with_usual_steps(first, first.prior)
+    longer = with_usual_steps(first, first.prior)
     rivals = {BALL: (Trials(ball, light), told), LONGER: (Trials(longer, light), told)}
 
     def scored(name: str, fold: int) -> Score:
@@ -133,7 +133,7 @@ def _refuted(volumes: Mapping[str, FirstVolumes], light: LightOptions, told: Hyp
     return select(STAGE, tuple(volumes), scored, by=BY_FISSION).choice != null
 
 
-def _with_usual_steps(first: FirstVolumes, prior: MaterialPrior) -> FirstVolumes:
+def with_usual_steps(first: FirstVolumes, prior: MaterialPrior) -> FirstVolumes:
     """The same, of the same δ/β, of matter as `prior` says, with the usual steps."""
     usual = HolographicTV()
     how = replace(first.options, retrieval=usual.retrieval, iterations=usual.iterations)

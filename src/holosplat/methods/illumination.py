@@ -90,10 +90,10 @@ def confirmed(task: Task, first: FirstVolumes, told: Hypothesis) -> Decision:
     """What first volumes have taken of light and noise beside what is told, against fits of smooth volumes.
 
     A first volume gains by a hypothesis that only steadies it: what it leaves of matter passes for correlated noise, or
-    for light. A fit through the waves, in units of the noise, leaves less. That there is a gain, first volumes have
-    shown in every fold; by fits to one of them it must be of practical size.
+    for light. A whole fit through the waves, in units of the noise, leaves less; its first steps say little of its end.
+    That there is a gain, first volumes have shown in every fold; by fits to one of them it must be of practical size.
     """
-    fits = TrialFits(task, first, {"continuous": SmoothVolume(rounds=1).with_effort(EFFORT)})
+    fits = TrialFits(task, first, {"continuous": SmoothVolume()})
     counts = range(len(told), len(first.taken))
     candidates = [name_of(first.taken[:count]) for count in (*counts, len(first.taken))]
     beside = {name_of(first.taken[: n + 1]): rivals(first.taken[:n], first.taken[n]) for n in counts}
