@@ -45,9 +45,9 @@ def decide_matter(task: Task, methods: Mapping[MatterKind, Method] | None = None
 
     A known material has one level, two have two: that is the null, which flat volumes may keep, but fits of `methods`
     for either kind alone overturn. Where less is known and there are such methods, the null is continuous matter, which
-    bounds nothing; where flat volumes predict neither better nor worse, or first volumes show no matter, these are
-    fitted: briefly at first, for bodies need more steps than a smooth volume, so that short fits which speak for levels
-    are enough. One ratio δ/β holds one level. Of views that are too few to set some aside, levels are taken.
+    bounds nothing, and is sure where it wins against levels; where flat volumes predict neither better nor worse, or
+    first volumes show no matter, these are fitted: bodies, which take longest, briefly at first, for short fits of
+    levels that predict better than a whole one of continuous matter are enough. One ratio δ/β holds one level. Of views that are too few to set some aside, levels are taken.
     """
     task.on_progress(STAGE, 0.0)
     first = first_of_task(task)
