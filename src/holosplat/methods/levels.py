@@ -47,7 +47,8 @@ def decide_matter(task: Task, methods: Mapping[MatterKind, Method] | None = None
     for either kind alone overturn. Where less is known and there are such methods, the null is continuous matter, which
     bounds nothing, and is sure where it wins against levels; where flat volumes predict neither better nor worse, or
     first volumes show no matter, these are fitted: bodies, which take longest, briefly at first, for short fits of
-    levels that predict better than a whole one of continuous matter are enough. One ratio δ/β holds one level. Of views that are too few to set some aside, levels are taken.
+    levels that predict better than a whole one of continuous matter are enough. One ratio δ/β holds one level. Of views
+    that are too few to set some aside, levels are taken.
     """
     task.on_progress(STAGE, 0.0)
     first = first_of_task(task)
