@@ -91,7 +91,7 @@ def confirmed(task: Task, first: FirstVolumes, told: Hypothesis) -> Decision:
 
     A first volume gains by a hypothesis that only steadies it: what it leaves of matter passes for correlated noise, or
     for light. A whole fit through the waves, in units of the noise, leaves less; its first steps say little of its end.
-    That there is a gain, first volumes have shown in every fold; by fits to one of them it must be of practical size.
+    That there is a gain, first volumes have shown; by fits it must be of practical size.
     """
     fits = TrialFits(task, first, {"continuous": SmoothVolume()})
     counts = range(len(told), len(first.taken))
@@ -102,7 +102,7 @@ def confirmed(task: Task, first: FirstVolumes, told: Hypothesis) -> Decision:
     def scored(name: str, fold: int) -> Score:
         return fits.score(name, "continuous", fold)
 
-    return select(STAGE, candidates, scored, by=by, beside=beside, surely=False)
+    return select(STAGE, candidates, scored, first.folds.count, by=by, beside=beside, surely=False)
 
 
 def prepared(task: Task, method: Method | None = None, before: Prepared | None = None) -> Task:
