@@ -71,8 +71,7 @@ def test_a_volume_that_agrees_with_noisy_frames_is_nearer_to_the_truth():
     for how in (HolographicTV(), HolographicTV().in_noise()):
         found, _ = holographic_tv(noisy.scan, MATTER, replace(how, refine=1), quiet)
         errors.append(error(found.numpy()))
-    assert errors[1] < 0.95 * errors[0]
-    assert errors[1] < 0.18
+    assert errors[1] < 0.8 * errors[0]
 
 
 # --- which way is gone --------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from holosplat.fit.whitened import WhitenedFrames
 from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import METHODS, SmoothVolume, Task, contrast
-from holosplat.methods.contrast import BELOW, BOTH, SPHERICAL, _refuted, both_sides, decide_sides, with_sign
+from holosplat.methods.contrast import BELOW, BOTH, SPHERICAL, _refuted, decide_sides, with_sign, with_usual_steps
 from holosplat.methods.illumination import prepared
 from holosplat.methods.method import first_of_task
 from holosplat.methods.spherical import AXES, WORTH, Sphere, SphericalFit, SphericalMatter
@@ -211,7 +211,7 @@ def test_what_other_matter_predicts_better_from_the_same_views_is_refuted(scan, 
     ]
     for given, refuted in ((scan, False), (of(ContinuousScene(tuple(lumps))), True)):
         first = first_of_task(Task(given, prior.signed(-1)))
-        two = both_sides(first)
+        two = with_usual_steps(first, first.prior.on_both_sides())
         sphere = replace(two, prior=two.prior.about_a_point(), _made={})
         assert _refuted({SPHERICAL: sphere, BELOW: first, BOTH: two}, PLAIN, ()) is refuted
     monkeypatch.setattr(contrast, "_refuted", lambda *_: True)

@@ -14,7 +14,7 @@ from holosplat.checks import NoMatterError
 from holosplat.geometry import Views
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import METHODS, Task
-from holosplat.methods.contrast import both_sides
+from holosplat.methods.contrast import with_usual_steps
 from holosplat.methods.cross_validation import FirstVolumes
 from holosplat.methods.illumination import prepared
 from holosplat.methods.levels import TrialFits, decide_ratio, ratio_of_one
@@ -186,7 +186,7 @@ def test_both_sides_and_fits_of_two_levels_have_the_ratio_that_was_decided(soft,
     first = first_of_task(task).at_ratio(777.0)
     asking = import_module("holosplat.methods.cross_validation")
     monkeypatch.setattr(asking, "unseen_ratio", lambda one: pytest.fail("a ratio was asked"))
-    assert both_sides(first).material.ratio == pytest.approx(777.0)
+    assert with_usual_steps(first, first.prior.on_both_sides()).material.ratio == pytest.approx(777.0)
 
     def solved(method, fitted):
         asked.append((one_material(fitted).ratio, method.gaussians.volume.refine))
