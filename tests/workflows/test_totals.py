@@ -105,7 +105,7 @@ def test_two_materials_and_free_channels_have_a_total():
     ):
         said = Prediction(VoxelGrid(values, grid, matter), scan.train().exposures, 2)
         found = total_of_run(said, scan.train(), Task(scan.train(), MaterialPrior.of_ratio(CELL.ratio)))
-        assert found.value == pytest.approx(true.sum() * np.prod(grid.voxel_size), rel=0.09, abs=0)
+        assert found.value == pytest.approx(true.sum() * np.prod(grid.voxel_size), rel=0.05, abs=0)
 
 
 def test_an_empty_volume_is_said_to_be_empty(scan):
@@ -127,7 +127,7 @@ def test_large_scans_are_binned_and_thinned(scan, monkeypatch):
     many = train[np.tile(np.arange(len(train)), 4)]
     assert len(many) > MOST_VIEWS
     found = total_of_run(Prediction(voxels, many.exposures, 2), many, Task(many, KNOWN))
-    assert found.value == pytest.approx(true.sum() * np.prod(grid.voxel_size), rel=0.05, abs=0)
+    assert found.value == pytest.approx(true.sum() * np.prod(grid.voxel_size), rel=0.09, abs=0)
 
 
 @pytest.mark.parametrize(("low", "high", "share"), [(480.0, 520.0, 0.036), (300.0, 800.0, 0.247)])
