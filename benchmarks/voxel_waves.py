@@ -3,8 +3,8 @@
     python benchmarks/voxel_waves.py [--out FILE]
 
 Three balls of water of 7, 9 and 12 pixels (20 keV, 10 cm, three views of 31 × 42 pixels), of which `simulate` makes the
-frames. `smooth` is what `VoxelLines` casts: lines of pixels as large as a voxel, band-limited between them; `steps` is
-the same matter on voxels as small as the samples, each with the value of the large one around it.
+frames. `smooth` are `BandLimitedVoxels`: lines of pixels as large as a voxel, band-limited between them; `steps` are
+strips of parts of voxels, as `VoxelGrid` casts them.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from holosplat.materials import parse_material
 from holosplat.matter import Matter
 from holosplat.methods.cross_validation import predicted_frames
 from holosplat.optics.sampling import fringe_sampling
-from holosplat.representations import VoxelGrid
+from holosplat.representations import BandLimitedVoxels, VoxelGrid
 from holosplat.scan import Exposures
 from holosplat.specimens.phantoms import packed_balls
 from holosplat.specimens.scene import MeshScene
@@ -45,12 +45,10 @@ def rows() -> Iterator[dict[str, object]]:
             scene = MeshScene.of_one_material([ball.mesh() for ball in balls], water)
             frames = torch.from_numpy(simulate(scene, exposures).frames)
             for refine, samples in ((1, 1), (1, 2), (1, 4), (1, 8), (2, 2), (2, 4), (2, 8)):
-                grid, factor = Grid.of_views(exposures.views, refine), samples // refine
+                grid = Grid.of_views(exposures.views, refine)
                 filled = torch.from_numpy(scene.voxelise(grid).delta / water.delta).float()[None]
-                smooth = VoxelGrid(filled, grid, Matter.one(*water))
-                for axis in (1, 2, 3):
-                    filled = filled.repeat_interleave(factor, axis)
-                steps = VoxelGrid(filled, grid.divided((factor,) * 3), Matter.one(*water))
+                steps = VoxelGrid(filled, grid, Matter.one(*water))
+                smooth = BandLimitedVoxels.of(steps)
                 left = (predicted_frames(exposures, one, samples) - frames for one in (smooth, steps))
                 shares = [f"{float((one.square().mean() / (frames - 1).square().mean()).sqrt()):.3f}" for one in left]
                 told = (f"{1e6 * pixel:g}", fringe_sampling(exposures), refine, samples, seed)

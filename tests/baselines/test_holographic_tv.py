@@ -184,7 +184,7 @@ def test_few_views_get_more_steps_a_round(cell_scan):
 
 def test_too_many_voxels_become_larger_ones(cell_scan):
     for most, shape in ((60_000, (40, 36, 40)), (30_000, (20, 18, 20)), (5_000, (13, 12, 13))):
-        options = replace(USUAL, max_voxels=most, corrections=3)
+        options = replace(USUAL, max_voxels=most, corrections=1)
         volume, grid = holographic_tv(cell_scan, CELL, options, quiet)
         assert volume.shape == shape == grid.shape
         assert volume.numel() <= most

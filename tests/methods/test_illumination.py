@@ -18,8 +18,8 @@ from holosplat.inference import Decision, Score
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import Auto, SmoothVolume, Task, trials
 from holosplat.methods.cross_validation import BY_FISSION, BY_VIEWS, FirstVolumes, Folds, plain_light
-from holosplat.methods.illumination import STAGE, prepared, shows_matter
-from holosplat.methods.levels import SHOWN
+from holosplat.methods.illumination import STAGE, confirmed, prepared, shows_matter
+from holosplat.methods.levels import SHOWN, TrialFits
 from holosplat.methods.method import first_of_task
 from holosplat.methods.trials import NULL, UNEVEN, WITHOUT, Trials, with_more
 from holosplat.optics.background import FLUX, Background, Light, LightOptions
@@ -359,3 +359,21 @@ def test_first_volumes_need_not_surely_show_matter(monkeypatch):
 def test_first_volumes_decide_where_they_show_matter(sharp):
     first = first_of_task(Task(sharp, PRIOR))
     assert shows_matter(first, LightOptions(), ()).choice == "as measured"
+
+
+@pytest.mark.parametrize(("later", "choice"), [(0.7, "correlated noise"), (1.0, NULL)])
+def test_whole_fits_confirm_by_the_folds_that_one_leaves_open(soft, monkeypatch, later, choice):
+    seen = set[int]()
+
+    def score(fits: TrialFits, name: str, kind: str, fold: int, two: bool = False) -> Score:
+        assert list(fits._methods) == ["continuous"]
+        assert fits._methods["continuous"] == SmoothVolume()
+        seen.add(fold)
+        scatter, power = np.array([0.8, 1.2]), 1.0 if fold == 0 else later
+        return Score(np.repeat(scatter * power if name != NULL else np.ones(2), 4)[:, None] * np.ones(3), 2)
+
+    monkeypatch.setattr(TrialFits, "score", score)
+    first = first_of_task(Task(soft, PRIOR))
+    first.taken = ("correlated noise",)
+    assert confirmed(Task(soft, PRIOR), first, ()).choice == choice
+    assert seen == {0, 1, 2}

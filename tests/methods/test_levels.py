@@ -184,6 +184,35 @@ def test_first_volumes_that_show_no_matter_do_not_decide_its_kind(soft):
     assert (found.choice, found.by) == ("one level", "views set aside, by fits")
 
 
+def test_continuous_matter_is_sure_where_all_folds_say_so(soft, monkeypatch):
+    """Its first two views leave it open, the six tell it: no method is fitted."""
+
+    def score(flat, name: str, fold: int) -> Score:
+        own = 1.0 if name == CONTINUOUS else 1.06
+        scatter = np.array([0.9, 1.1]) if name != CONTINUOUS and fold == 0 else np.ones(2)
+        return Score(own * np.repeat(scatter, 4)[:, None] * np.ones(3), 2)
+
+    monkeypatch.setattr("holosplat.methods.levels._FlatVolumes.score", score)
+    monkeypatch.setattr(TrialFits, "score", lambda *_: pytest.fail("a method was fitted"))
+    found = decide_matter(Task(soft, RATIO), {"levels": Auto().gaussians, "continuous": Auto().volume})
+    assert found.choice == CONTINUOUS
+
+
+def test_continuous_matter_has_all_its_steps_beside_short_fits_of_bodies(soft, monkeypatch):
+    efforts = list[tuple[int, int]]()
+
+    def score(fits, name, kind, fold, two=False) -> Score:
+        bodies, volume = (fits._methods[one] for one in ("levels", "continuous"))
+        efforts.append((bodies.fit.schedule.steps, volume.iterations))
+        return Score(np.ones((8, 3)), 2)
+
+    monkeypatch.setattr(TrialFits, "score", score)
+    methods = {"levels": Auto().gaussians, "continuous": Auto().volume}
+    decide_matter(Task(soft, MaterialPrior.known(MATERIAL)), methods)
+    assert {steps for steps, _ in efforts} == {round(0.2 * Auto().gaussians.fit.schedule.steps)}
+    assert {iterations for _, iterations in efforts} == {Auto().volume.iterations}
+
+
 def test_fits_must_win_in_every_fold(soft, monkeypatch):
     """Continuous matter explains the first two unseen views ten and four times better, and the others worse."""
 

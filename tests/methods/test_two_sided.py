@@ -256,6 +256,23 @@ def test_frames_are_left_alone_where_both_sides_explain_them_as_well(bodies, mon
     assert decide_sides(first, LightOptions(), first.taken)[1].choice == ABOVE  # its user says what the light is
 
 
+@pytest.mark.parametrize(("longer", "chosen"), [(2.0, BOTH), (0.9, ABOVE)])
+def test_both_sides_do_not_win_by_their_steps(bodies, monkeypatch, longer, chosen):
+    """Matter on one side by as many steps must not predict as well."""
+    usual = HolographicTV().iterations
+
+    def score(trials: Trials, name: str, fold: int) -> Score:
+        first = trials.first
+        one = longer if first.options.iterations == usual else 2.0
+        power = 1.0 if first.prior.two_sided and not first.prior.spherical else one
+        return Score(np.full((8, 3), 9.0 if WITHOUT in name or first.prior.spherical else power), 2)
+
+    monkeypatch.setattr(Trials, "score", score)
+    first = first_of_task(Task(bodies, MaterialPrior.of_ratio(1500).signed(1)))
+    assert first.options.iterations < usual
+    assert decide_sides(first, LightOptions())[1].choice == chosen
+
+
 def test_light_that_is_uneven_stays_beside_bodies(bodies):
     """Matter on both sides does not explain what light does."""
     rows, columns = np.mgrid[-1 : 1 : SHAPE[0] * 1j, -1 : 1 : SHAPE[1] * 1j]

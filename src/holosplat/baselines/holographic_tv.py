@@ -23,7 +23,6 @@ from ..memory import memory_kept
 from ..model import Instrument, SolvedLight
 from ..optics.background import Light
 from ..optics.noise import NoiseModel, noise_share
-from ..optics.resampling import refined
 from ..optics.retrieval import Tikhonov, absorption_alone, tikhonov
 from ..optics.retrieval.bounded import FIXED, MODEL_ERROR, NOWHERE, Leaves
 from ..optics.retrieval.spectra import Raster, filtered, radian, response, spectra, surrounded
@@ -34,7 +33,7 @@ from ..ranges import Metres, Natural, Weight, checked_dataclass
 from ..scan import Scan
 from .beyond import Margins, carried_on, columns_beyond, rows_beyond, unseen_rays
 from .primal_dual import PrimalDual
-from .rays import frames_of, photons_left, rays_of
+from .rays import frames_of, photons_left, rays_of, refined
 from .tomography import TotalVariation, tv_solver
 
 IN_NOISE = 1.0
@@ -305,8 +304,7 @@ def _agree(
     field = _field(scan, coarse)
     beyond, views = _margins(coarse.volume, scan), field.in_units_of(pitch)
     unseen = unseen_rays(scan, beyond)
-    if unseen is not None:
-        unseen = unseen.repeat_interleave(refine, 1).repeat_interleave(refine, 2).to(coarse.volume.device)
+    unseen = None if unseen is None else refined(unseen.float(), refine).to(coarse.volume.device) > 0.5
     correction = Correction(scan, material, beyond[0], correlated(light))
     finer = math.ceil(fringe_sampling(scan.exposures, voxels=refine) / refine)
     instrument = Instrument(scan.exposures, refine * finer, backend=options.backend)

@@ -112,3 +112,10 @@ def frames_of(instrument: Instrument, lines: Tensor, material: DeltaBeta) -> Ten
     rows, columns = ((n - seen) // 2 for n, seen in zip(instrument.views.shape, lines.shape[1:]))
     padded = pad(lines, (columns, columns, rows, rows))  # below 0 it cuts
     return instrument.frames(LineIntegrals(padded[:, None], ((material.delta, material.beta),)))
+
+
+def refined(images: Tensor, factor: int) -> Tensor:
+    """Images [V, H, W] on a raster `factor` times finer."""
+    if factor == 1:
+        return images
+    return interpolate(images[None], scale_factor=factor, mode="bilinear", align_corners=False)[0]

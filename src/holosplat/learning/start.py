@@ -18,14 +18,13 @@ from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, pad
 
-from ..baselines.rays import frames_of
+from ..baselines.rays import frames_of, refined
 from ..checks import InputError, as_written, require, require_regular
 from ..geometry import Grid, Views
 from ..io.atomic import atomic_path
 from ..matter import DeltaBeta
 from ..model import Instrument
 from ..optics.noise import noise_levels
-from ..optics.resampling import refined
 from ..optics.retrieval import FIXED, Tikhonov, tikhonov
 from ..optics.sampling import fringe_sampling
 from ..progress import Progress

@@ -79,10 +79,9 @@ def decide_sides(
     where these are alike, the frames are left alone. No bound ends their volumes sooner, so that these have more steps
     than first volumes; nor may they win by these alone. Spherical matter, which has the fewest unknowns, is asked for
     before any on both sides, and must predict more than a sphere on one side. What predicts unseen views by its few
-    unknowns may yet leave much of those that it was fitted to, so it is refuted where other matter predicts both
-    together better, the noise of fitted ones apart (data fission). spherical: whether it is asked for, as methods that
-    have it do. Of one view or two, none is unseen, and what is free on both sides is not asked for, but may refute what
-    is spherical.
+    unknowns may yet leave much of those that it was fitted to, so it is refuted where other matter predicts the same
+    views better, their noise apart (data fission). spherical: whether it is asked for, as methods that have it do. Of
+    one view or two, none is unseen, and what is free on both sides is not asked for, but may refute what is spherical.
     """
     first.on_progress(STAGE, 0.0)
     one = ABOVE if first.prior.delta_sign > 0 else BELOW
@@ -118,26 +117,20 @@ def decide_sides(
 
 
 def _refuted(volumes: Mapping[str, FirstVolumes], light: LightOptions, told: Hypothesis) -> bool:
-    """Whether other volumes than the first ones predict all frames better: unseen ones, and the same views with other
-    noise. Of frames without noise, a free volume explains what it has seen to the last digit, and no view beside it."""
-    null, first = next(iter(volumes.items()))
-    halves = {
-        name: replace(one, folds=replace(one.folds, count=1, by=BY_FISSION), _made={}) for name, one in volumes.items()
-    }
-    unseen = range(0 if first.folds.by == BY_FISSION else first.folds.count)
+    """Whether other volumes than the first ones predict the same views with other noise better."""
+    tried = {}
+    for name, one in volumes.items():
+        halves = replace(one, folds=replace(one.folds, count=1, by=BY_FISSION), _made={})
+        tried[name] = Trials(halves, light)
 
     def scored(name: str, fold: int) -> Score:
-        parts = [(halves[name], 0), *((volumes[name], fold) for fold in unseen)]
-        return Score.joined([_score(one, light, told, fold) for one, fold in parts])
+        try:
+            return tried[name].score(name_of(told), fold)
+        except InputError:  # there is no such matter
+            return without_matter(next(iter(volumes.values())), fold)
 
-    return select(STAGE, tuple(volumes), scored, by=f"{first.folds.by}, and {BY_FISSION}").choice != null
-
-
-def _score(first: FirstVolumes, light: LightOptions, told: Hypothesis, fold: int) -> Score:
-    try:
-        return Trials(first, light).score(name_of(told), fold)
-    except InputError:  # there is no such matter
-        return without_matter(first, fold)
+    null = next(iter(volumes))
+    return select(STAGE, tuple(volumes), scored, by=BY_FISSION).choice != null
 
 
 def with_usual_steps(first: FirstVolumes, prior: MaterialPrior) -> FirstVolumes:

@@ -33,7 +33,7 @@ from ..optics.noise import NoiseModel, noise_levels
 from ..optics.retrieval import paganin
 from ..optics.sampling import alike, fringe_sampling
 from ..progress import Progress
-from ..representations import Stored, VoxelGrid
+from ..representations import BandLimitedVoxels, Stored, VoxelGrid
 from ..scan import Exposures, Scan
 from ..volume import Object
 from .spherical import SphericalMatter, likeliest_sphere
@@ -370,5 +370,5 @@ def lit_by_halves(measured: Tensor, predicted: Tensor, known: Background) -> Ten
 
 
 def predictions(found: Object, scan: Scan) -> Tensor:
-    """Frames [V, H, W] of an object in even light."""
-    return predicted_frames(scan.exposures, found)
+    """Frames [V, H, W] of an object in even light, without the steps between voxels (`BandLimitedVoxels`)."""
+    return predicted_frames(scan.exposures, BandLimitedVoxels.of(found) if isinstance(found, VoxelGrid) else found)

@@ -39,7 +39,7 @@ class Resampling:
     def __init__(self, source: tuple[int, int], pixel: float, shape: tuple[int, int], target: float) -> None:
         self.shape = shape
         self._ratio = positive("target pixel size", target, "metres") / positive("pixel size", pixel, "metres")
-        self._rows, self._columns = (cosine_series(n, m, self._ratio) for n, m in zip(source, shape))
+        self._rows, self._columns = (_matrix(n, m, self._ratio) for n, m in zip(source, shape))
         self.extra_blur = math.sqrt(max(pixel**2 - target**2, 0.0) / 12)
         """Standard deviation [m] that the point-spread function of the resampled frames has beside its own."""
 
@@ -48,26 +48,25 @@ class Resampling:
         return self._rows @ np.asarray(frame, dtype=np.float64) @ self._columns.T
 
 
-def refined(images: Tensor, factor: int) -> Tensor:
-    """Band-limited means [..., H, W] over pixels as those over pixels `factor` times smaller, which are sharper;
+def between(images: Tensor, factor: int) -> Tensor:
+    """Images [..., H, W] at samples `factor` times as dense, band-limited between those that there are;
     differentiable."""
     if factor == 1:
         return images
-    rows, columns = (_finer(n, factor).to(images) for n in images.shape[-2:])
+    rows, columns = (_denser(n, factor).to(images) for n in images.shape[-2:])
     return rows @ images @ columns.T
 
 
 @lru_cache(maxsize=8)
-def _finer(count: int, factor: int) -> Tensor:
-    return torch.from_numpy(cosine_series(count, count * factor, 1 / factor, sharper=True))
+def _denser(count: int, factor: int) -> Tensor:
+    return torch.from_numpy(_matrix(count, count * factor, 1 / factor))
 
 
-def cosine_series(count: int, target: int, ratio: float, sharper: bool = False) -> np.ndarray:
-    """[target, count]: the filtered cosine series of `count` samples, at `target` places `ratio` times as far apart;
-    sharper: on finer pixels without the blur of the coarse ones."""
+def _matrix(count: int, target: int, ratio: float) -> np.ndarray:
+    """[target, count]: the filtered cosine series of `count` samples, at `target` places `ratio` times as far apart."""
     k = np.arange(count)
     frequency = 0.5 * k / count  # cycles a pixel
-    kept = np.sinc(frequency * ratio) / np.sinc(frequency) if ratio > 1 or sharper else np.ones(count)
+    kept = np.sinc(frequency * ratio) / np.sinc(frequency) if ratio > 1 else np.ones(count)
     places = 0.5 * count + (np.arange(target) + 0.5 - 0.5 * target) * ratio  # from the border, in pixels
     series = np.cos(np.pi * np.outer(places, k) / count) * kept
     forward = np.asarray(dct(np.eye(count), axis=0)) / count  # of each sample's unit frame

@@ -53,8 +53,8 @@ def fringe_sampling(exposures: Exposures, extra: int = 0, voxels: float = math.i
 
     Frames whose first fringe is narrower than `NARROWEST_FRINGE` pixels, or that have none, need one sample a pixel.
     Matter on voxels, so many along a pixel's edge, has nothing finer than these: one sample a voxel shows it, and two a
-    pixel the intensities, which have twice the band of waves. Where the phase of a known wall jumps by more than half a
-    wave from one pixel to the next, there are twice as many.
+    pixel the intensities, which have twice the band of waves. More would show the edges of voxels as fringes. Where the
+    phase of a known wall jumps by more than half a wave from one pixel to the next, there are twice as many.
     """
     steep = 2 if _is_steep(exposures) else 1
     exposures = exposures.optical

@@ -17,7 +17,7 @@ from .initialise import approximate, at_pitch, cloud_from_shares, cloud_from_vol
 from .isosurface import isosurface
 from .moving_gaussians import MovingGaussians
 from .surfaces import MovingSurfaces, SurfaceMesh
-from .voxels import VoxelGrid, VoxelLines
+from .voxels import BandLimitedVoxels, VoxelGrid, VoxelLines
 
 
 @runtime_checkable
@@ -82,6 +82,7 @@ KINDS: Extended[type[Stored]] = Extended(
 
 __all__ = [
     "KINDS",
+    "BandLimitedVoxels",
     "Fading",
     "Flow",
     "GaussianCloud",

@@ -18,7 +18,7 @@ from ..checks import require
 from ..display import of_object
 from ..geometry import Grid, Poses, Views
 from ..matter import Matter
-from ..optics.resampling import refined
+from ..optics.resampling import between
 from ..projectors.voxels import LatticeProjector, RayProjector, SliceProjector
 from ..volume import LineIntegrals, Unmoved, Volume
 
@@ -40,10 +40,6 @@ class VoxelLines:
     one leaves on rotated rasters. Voxels larger than the pixels asked for are interpolated to their size first. Cones:
     a ray to every pixel (`RayProjector`).
 
-    Matter on voxels has nothing finer than these. On pixels about the y axis that are so many times smaller, the lines
-    are those of pixels as large as a voxel, band-limited between them (`optics.resampling.refined`): strips of a part
-    of a voxel would show the steps between voxels, which light behind strong matter turns into fringes.
-
     `Poses` are unknown where gradients of their rotations or shifts are asked for. They are taken as they are now: make
     new lines when they change. They always go through the lattice, be they about the y axis or not, because strip
     integrals cannot say what a turn out of the axis does; values there differ from the strips' by the ripple.
@@ -55,10 +51,7 @@ class VoxelLines:
         if known.sources is not None:
             self._lines = RayProjector(grid, known, backend).lines
         elif isinstance(known, Views) and known.shares_axis:
-            factor, (h, w) = _finer(grid, known), known.shape
-            larger = replace(known, shape=(h // factor, w // factor), pitch=factor * known.pitch)
-            strips = _AboutAxis(grid, larger, backend)
-            self._lines = lambda values: refined(strips(values), factor)
+            self._lines = _AboutAxis(grid, known, backend)
         else:
             self._lines = _AnyPose(grid, known, backend)
 
@@ -67,13 +60,6 @@ class VoxelLines:
         shape = tuple(values.shape[1:])
         require(shape == self.grid.shape, f"values must lie on the grid {self.grid.shape}, but on {shape}.")
         return torch.stack([self._lines(channel.float()) for channel in values], dim=1)
-
-
-def _finer(grid: Grid, views: Views) -> int:
-    """Pixels along the edge of the smallest voxel, at most as many as make rows and columns of whole voxels."""
-    h, w = views.shape
-    most = math.floor(min(grid.voxel_size) / views.finest + 1 - SAME)
-    return max((n for n in range(2, most + 1) if h % n == w % n == 0), default=1)
 
 
 class _AboutAxis:
@@ -261,3 +247,34 @@ class VoxelGrid(Unmoved):
     def freed(self) -> VoxelGrid:
         """The same matter with δ and β free: a single occupancy in both channels."""
         return VoxelGrid(self.values[:1].repeat(2, 1, 1, 1), self.grid, self.matter.freed())
+
+
+class BandLimitedVoxels(VoxelGrid):
+    """Voxels whose lines about the y axis have nothing finer than a voxel, as those that hypotheses are judged by.
+
+    On pixels that are so many times smaller, they are those of pixels as large as a voxel, and band-limited between
+    their samples. Strips of a part of a voxel show the steps between voxels in views along the axes of the grid, which
+    light behind strong matter turns into fringes.
+    """
+
+    @classmethod
+    def of(cls, found: VoxelGrid) -> BandLimitedVoxels:
+        """The same voxels, on their backend, with the projectors that they have ready."""
+        made = cls(found.values, found.grid, found.matter)
+        made.backend, made._projectors = found.backend, found._projectors
+        return made
+
+    def project(self, views: Views | Poses) -> LineIntegrals:
+        """Line integrals (B, D), differentiable in the values."""
+        seen = views if isinstance(views, Views) else views.views()
+        (h, w), factor = seen.shape, self._finer(seen)
+        lines = super().project(replace(seen, shape=(h // factor, w // factor), pitch=factor * seen.pitch))
+        return LineIntegrals(between(lines.channels, factor), self.matter.channels)
+
+    def _finer(self, views: Views) -> int:
+        """Pixels along the edge of the smallest voxel, at most as many as make rows and columns of whole voxels."""
+        if views.sources is not None or not views.shares_axis:
+            return 1  # rays and hats, which have no steps
+        h, w = views.shape
+        most = math.floor(min(self.grid.voxel_size) / views.finest + 1 - SAME)
+        return max((n for n in range(2, most + 1) if h % n == w % n == 0), default=1)
