@@ -9,7 +9,7 @@ from helpers.soft import MATERIAL, two_cells
 from holosplat.beamline.simulate import simulate
 from holosplat.geometry import Views
 from holosplat.matter import DeltaBeta, MaterialPrior
-from holosplat.methods import Auto, Task
+from holosplat.methods import Auto, Task, trials
 from holosplat.methods.cross_validation import BY_VIEWS
 from holosplat.methods.trials import decide_kind, unseen_kinds
 from holosplat.representations import GaussianCloud, SurfaceMesh, VoxelGrid
@@ -46,10 +46,19 @@ def test_soft_bodies_are_gaussians():
     assert found.choice == GaussianCloud.kind
 
 
-def test_a_kind_that_the_short_run_does_not_make_is_not_compared(sharp):
+def test_a_kind_that_the_run_on_coarse_frames_does_not_make_is_not_compared(sharp):
     """It was given the other's score: a gain of exactly 0, with which the null won."""
     for null, other in ((SurfaceMesh.kind, VoxelGrid.kind), (VoxelGrid.kind, SurfaceMesh.kind)):
         assert decide_kind(sharp, Auto().volume.with_effort(0.3), null, other) is None
+
+
+def test_kinds_are_compared_after_all_steps(sharp, monkeypatch):
+    """Of soft cells in uneven light, surfaces left 12 % less than Gaussians after a fifth of them, and 5 % more at the
+    end."""
+    ran = []
+    monkeypatch.setattr(trials, "run_stages", lambda method, part, look: ran.append(method))
+    assert decide_kind(sharp, BODIES, SurfaceMesh.kind, GaussianCloud.kind) is None
+    assert ran == [BODIES]
 
 
 def test_which_runs_have_a_choice_of_kinds(sharp):

@@ -22,7 +22,6 @@ from ..optics.patterns import fixed_pattern, smooth_modes
 from ..representations import Stored, VoxelGrid
 from ..scan import Scan
 from .cross_validation import (
-    EFFORT,
     FirstVolumes,
     Folds,
     coarse_binning,
@@ -266,14 +265,14 @@ def unseen_kinds(task: Task, method: Method) -> Unseen | None:
 
 
 class _NotMade(Exception):
-    """A kind that a short run does not make."""
+    """A kind that a run on coarse frames does not make."""
 
 
 def decide_kind(task: Task, method: Method, null: str, other: str) -> Decision | None:
     """Which kind of result predicts unseen views, where `method` makes both on its way; null: the kind of its last one.
 
-    The method runs on coarse frames of the other views, with a part `EFFORT` of its steps. Where it does not make both
-    there, they cannot be compared: None. Two views are compared by data fission.
+    The method runs on coarse frames of the other views, with all of its steps, for what the first ones leave may say the
+    opposite. Where it does not make both there, they cannot be compared: None. Two views are compared by data fission.
     """
     folds = Folds.of(task.scan)
 
@@ -288,7 +287,7 @@ def decide_kind(task: Task, method: Method, null: str, other: str) -> Decision |
 
         part = replace(task, scan=seen, lit=lit, first=None, near=False, on_start=unheard)
         with suppress(NoMatterError):  # what is made before it stands
-            run_stages(method.with_effort(EFFORT), part, look)
+            run_stages(method, part, look)
         expected = {kind: predicted_frames(unseen.exposures, *state) for kind, state in last.items()}
         return {kind: Score.of(unseen.left(frames.double())) for kind, frames in expected.items()}
 
