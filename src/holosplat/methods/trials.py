@@ -271,8 +271,8 @@ class _NotMade(Exception):
 def decide_kind(task: Task, method: Method, null: str, other: str) -> Decision | None:
     """Which kind of result predicts unseen views, where `method` makes both on its way; null: the kind of its last one.
 
-    The method runs on coarse frames of the other views, with all of its steps, for what the first ones leave may say the
-    opposite. Where it does not make both there, they cannot be compared: None. Two views are compared by data fission.
+    The method runs on coarse frames of the other views, with all of its steps: the first ones may say the opposite.
+    Where it does not make both there, they cannot be compared: None. Two views are compared by data fission.
     """
     folds = Folds.of(task.scan)
 
