@@ -347,20 +347,3 @@ def test_bad_numbers_of_options():
         Projections(feedback=-1.0)
     assert tikhonov is RETRIEVALS["tikhonov"]
     assert admm is RETRIEVALS["admm"]
-
-
-@pytest.mark.parametrize(("radius_px", "count", "lambda_z", "most"), [(2.5, 40, 0.6, 0.2), (14.0, 2, 25.0, 0.1)])
-def test_bounds_tell_what_noise_hides_of_a_frame(radius_px, count, lambda_z, most):
-    """Of many small balls, bounds know the lowest frequencies better than noisy frames do; of thick ones, frames do."""
-    where, delta = exposures((61, 84), at(lambda_z)), 0.4 / (K * radius_px * PITCH)
-    places = np.random.default_rng(4).uniform(-1, 1, (count, 2)) * (26.0, 18.0)
-
-    def balls(views: Views) -> Tensor:
-        x, y = pixels(views)
-        inside = ((radius_px * PITCH) ** 2 - _squared_distance(x, y, tuple(place)) for place in places)
-        return sum((2 * one.clamp_min(0).sqrt() for one in inside), start=torch.zeros(views.shape, dtype=DOUBLE))
-
-    truth, frames = taken(balls, where, delta, delta / 2800)
-    estimate = bounded_estimate(noisy(frames, 1e4), where, 1 / 2800, None)
-    error = relative_error(estimate.phase, truth * K * delta)
-    assert error < most

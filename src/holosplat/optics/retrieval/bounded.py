@@ -15,7 +15,7 @@ from torch.nn.functional import max_pool2d
 
 from ...scan import Exposures
 from ..noise import wavelet_noise, with_gaps
-from .spectra import TINY, Gaps, Noise, Prior, Raster, Spectra, filtered, response, spectra, surrounded, with_power
+from .spectra import TINY, Gaps, Noise, Prior, Raster, Spectra, filtered, response, spectra, surrounded
 
 STEPS = 25
 """Alternations between the frame and the bound. Where noise hides the lowest frequencies they go on to drift."""
@@ -61,9 +61,7 @@ def bounded_estimate(
     Wiener's inverse `W` of the contrast transfer function, in alternation with the bound (Papoulis 1975 and
     Gerchberg 1974, who extend spectra so): `φ ← φ₀ + (1 - W H) [φ]`, where `[φ]` is φ where it exceeds
     `SIGNIFICANT` deviations of its noise and zero elsewhere, for noise with its negative half cut off would pass for
-    matter (a support found anew in every round: the "shrinkwrap" of Marchesini et al. 2003). Of that, `W` weighs what
-    the frames say by the power expected of the phase, and then, in as many rounds more, by that of what [φ] lacks:
-    bounds know low frequencies that noise hides better than the frames do.
+    matter (a support found anew in every round: the "shrinkwrap" of Marchesini et al. 2003).
 
     Frames of one pose at several distances (`SharedPoses`) have one estimate, by all of them.
     missing: pixels [V, H, W] bool without a value (`completed`). two_sided: whether phases may be negative.
@@ -75,26 +73,25 @@ def bounded_estimate(
     raster = Raster((contrast.shape[-2], contrast.shape[-1]), exposures.views.pixel_size)
     h, prior = response(exposures, ratio, raster), prior or (FIXED if any(leaves) else None)
     known = spectra(frames, exposures, h, raster, noise, MODEL_ERROR, prior, leaks=prior is None, missing=missing)
-    contrast = completed(contrast, missing, crop, known)
-    fine = wavelet_noise(with_gaps(frames, missing))
-    inside = torch.zeros_like(contrast[:1])
+    trusted = 1 - known.poses.sum(known.inverse * known.response)
+    if noise is None:
+        gain = known.inverse.square().mean(dim=(1, 2))
+        doubtful = known.poses.sum(wavelet_noise(with_gaps(frames, missing)).square() * gain).sqrt()
+    else:
+        doubtful = known.noise_of(known.inverse)
+    least = (SIGNIFICANT * doubtful)[:, None, None]
+    linear = -sign * known.poses.sum(filtered(completed(contrast, missing, crop, known), known.inverse))
+    inside = torch.zeros_like(linear[:1])
     inside[:, *(slice(None) if on else part for on, part in zip(leaves, crop[1:]))] = 1
-    matter = torch.zeros_like(contrast)
-    for again in (False, True) if prior is None else (False,):
-        if again:
-            left = (contrast + sign * filtered(matter, h))[crop] + 1
-            known = with_power(known, left, exposures, raster, noise)
-        if noise is None:
-            doubtful = known.poses.sum(fine.square() * known.inverse.square().mean(dim=(1, 2))).sqrt()
-        else:
-            doubtful = known.noise_of(known.inverse)
-        least = (SIGNIFICANT * doubtful)[:, None, None]
-        linear = -sign * known.poses.sum(filtered(contrast, known.inverse))
-        trusted = 1 - known.poses.sum(known.inverse * known.response)
-        for _ in range(1 + (LEAVING_STEPS if any(leaves) else STEPS)):
-            phase = linear + filtered(matter, trusted)
-            matter = phase * ((phase.abs() if two_sided else phase) > least) * inside
-    matter = matter[crop]
+    phase = linear
+
+    def matter_of(phase: Tensor) -> Tensor:
+        return phase * ((phase.abs() if two_sided else phase) > least)
+
+    for _ in range(LEAVING_STEPS if any(leaves) else STEPS):
+        matter = matter_of(phase) * inside
+        phase = linear + filtered(matter, trusted)
+    matter = matter_of(phase)[crop]
     grown = max_pool2d((matter != 0).double()[None], 3, 1, 1)[0] > 0  # thin rims lie below the threshold
     return Estimate(matter, grown)
 
