@@ -5,15 +5,25 @@ from __future__ import annotations
 import importlib
 import re
 
+import numpy as np
 import pytest
 import torch
 
 from holosplat import backends, native
-from holosplat.backends import DESCRIPTIONS, NAMES, SUPPORT, missing, resolve, support_table
+from holosplat.backends import DESCRIPTIONS, NAMES, SUPPORT, coarse_work, missing, resolve, support_table
+from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError, MissingError
 from holosplat.cli import commands
 from holosplat.cli.commands import Asked
 from holosplat.cli.options import MethodOptions
+from holosplat.geometry import Views
+from holosplat.matter import DeltaBeta, MaterialPrior
+from holosplat.methods import Auto, Task
+from holosplat.methods.illumination import prepared
+from holosplat.methods.solve import settled
+from holosplat.scan import Exposures
+from holosplat.specimens.red_cells import random_cells
+from holosplat.specimens.scene import MeshScene
 
 GONE = "a reason"
 
@@ -126,3 +136,36 @@ def test_the_command_line_lists_and_refuses(monkeypatch, capsys, tmp_path):
 def test_a_backend_that_an_operation_lacks_is_missing():
     with pytest.raises(MissingError, match=r"mesh cannot use backend 'cpu'"):
         backends.implementation("holosplat.projectors.mesh", "cpu")
+
+
+@pytest.fixture
+def three_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.usefixtures("three_threads")
+def test_coarse_work_takes_one_thread_and_gives_the_others_back():
+    @coarse_work()
+    def failing(threads: int) -> None:
+        assert torch.get_num_threads() == threads
+        raise InputError("no matter.")
+
+    with pytest.raises(InputError):
+        failing(1)
+    assert torch.get_num_threads() == 3
+
+
+@pytest.mark.usefixtures("three_threads")
+def test_decisions_are_coarse_work():
+    """The light, and the kind of matter, of two views, of which there is little to decide."""
+    threads = list[int]()
+    views = Views.evenly_spaced(2, (16, 17), 1e-6)
+    scene = MeshScene.of_one_material(random_cells(1, (16e-6,) * 3, 1), DeltaBeta(4e-7, 4e-10))
+    scan = simulate(scene, Exposures.of(views, 20.0, 0.05), is_test=np.zeros(2, dtype=bool))
+    task = Task(scan, MaterialPrior.unknown(), on_progress=lambda stage, part: threads.append(torch.get_num_threads()))
+    settled(Auto(), prepared(task, Auto()))
+    assert set(threads) == {1}
+    assert torch.get_num_threads() == 3

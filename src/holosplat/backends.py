@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import importlib.util
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from types import ModuleType
 from typing import Literal, get_args
@@ -16,6 +18,7 @@ import torch
 
 from . import native
 from .checks import InputError, MissingError, require
+from .memory import memory_kept
 from .units import number_of
 
 Backend = Literal["auto", "cpu", "cuda", "reference"]
@@ -137,3 +140,16 @@ def device_name(backend: str) -> str:
         return "Triton's interpreter" if interpreted() else torch.cuda.get_device_name()
     threads = number_of(torch.get_num_threads(), "thread")
     return f"CPU, {threads}" + (f", {native.used_isa()}" if backend == "cpu" else "")
+
+
+@contextmanager
+def coarse_work() -> Iterator[None]:
+    """For work on frames of some 64 pixels: it takes one thread, as several wait for each other as long as they save,
+    and keeps its memory (`memory_kept`)."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with memory_kept():
+            yield
+    finally:
+        torch.set_num_threads(before)

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..backends import resolve
+from ..backends import coarse_work, resolve
 from ..baselines import HolographicTV, holographic_tv
 from ..checks import InputError, require
 from ..inference import Decision, Score, select
@@ -105,6 +105,7 @@ def confirmed(task: Task, first: FirstVolumes, told: Hypothesis) -> Decision:
     return select(STAGE, candidates, scored, first.folds.count, by=by, beside=beside, surely=False)
 
 
+@coarse_work()
 def prepared(task: Task, method: Method | None = None, before: Prepared | None = None) -> Task:
     """The task with frames in even light, where evidence or `task.light` says that their light was not even; and, where
     nothing tells it, with the sign of the contrast (`contrast`), which is decided first.

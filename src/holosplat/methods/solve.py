@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from ..backends import resolve
+from ..backends import coarse_work, resolve
 from ..checks import require
 from ..inference import Decision
 from ..matter import MaterialPrior, MatterKind
@@ -63,6 +63,7 @@ class Settled:
         return replace(told(task, self.constants), matter=self.matter, decisions=(*task.decisions, self.decision))
 
 
+@coarse_work()
 def settled(
     method: Method, task: Task, matter: MatterKind | None = None, uncertain: Uncertain | None = None
 ) -> Settled:

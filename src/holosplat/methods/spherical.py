@@ -97,22 +97,32 @@ class SphericalMatter(Unmoved):
         With `q(n) = ½ (n √(n² - ρ²) - ρ² arcosh(n / ρ))` at a distance ρ < n from the centre, else 0, they are
         `2 Σ q(n) (u(n-1) - 2 u(n) + u(n+1))`: Abel's transform of straight pieces (Bracewell 2000, chapter 14).
         """
-        ends = torch.cat([self.values, self.values.new_zeros(2)])
-        bends = (2 * ends.diff(n=2)).tolist()  # at the radii 1, 2, …
-        found = [torch.stack([b * _rings(r, n + 1) for n, b in enumerate(bends)]).sum(0) for r, _ in self._seen(views)]
-        return torch.stack(found).float()
+        bends, per_view = self._bends(), list[Tensor]()
+        for radius, _ in self._seen(views):
+            order, pieces = _pieces(radius, len(bends))
+            lines = torch.zeros(len(order), dtype=torch.float64)
+            for bend, (ring, _) in zip(bends, pieces):
+                lines[: len(ring)].add_(ring, alpha=bend)
+            per_view.append(lines.float()[order.argsort()].reshape(radius.shape))
+        return torch.stack(per_view)
 
     def slopes(self, views: Views) -> list[Tensor]:
         """Derivatives [V, H, W] of `lines` by the centre along x, y, z, in units of the spacing, and by the values."""
-        ends = torch.cat([self.values, self.values.new_zeros(2)])
-        bends = 2 * ends.diff(n=2)
-        count, per_view = len(self.values), list[Tensor]()
+        bends, per_view = self._bends(), list[Tensor]()
         for radius, way in self._seen(views):
-            angles = [-radius * (n / radius).clamp_min(1).acosh() for n in range(1, count + 1)]  # of q by ρ
-            moved = sum(bend * angle for bend, angle in zip(bends.tolist(), angles)) * way
-            rings = torch.stack([torch.zeros_like(radius)] * 2 + [_rings(radius, n) for n in range(1, count + 1)])
-            per_view.append(torch.cat([moved, 2 * rings.diff(n=2, dim=0)]).float())
+            order, pieces = _pieces(radius, len(bends))
+            moved, rings = (torch.zeros(n, len(order), dtype=torch.float64) for n in (1, len(bends) + 2))
+            for n, (bend, (ring, angle)) in enumerate(zip(bends, pieces), 2):
+                moved[0, : len(ring)].add_(angle, alpha=bend)
+                rings[n, : len(ring)] = ring
+            found = torch.cat([moved, 2 * rings.diff(n=2, dim=0)]).float()[:, order.argsort()]
+            moved, rest = found.reshape(-1, *radius.shape).split([1, len(bends)])
+            per_view.append(torch.cat([moved * way.float(), rest]))
         return list(torch.stack(per_view, dim=1))
+
+    def _bends(self) -> list[float]:
+        """Twice the second differences of the values, at the radii 1, 2, …"""
+        return (2 * torch.cat([self.values, self.values.new_zeros(2)]).diff(n=2)).tolist()
 
     def _seen(self, views: Views) -> Iterator[tuple[Tensor, Tensor]]:
         """Of each view the distances [H, W] of the centre from the pixels' rays, in units of the spacing, and the
@@ -135,10 +145,18 @@ class SphericalMatter(Unmoved):
             yield torch.from_numpy(radius), torch.from_numpy(direction)
 
 
-def _rings(radius: Tensor, n: int) -> Tensor:
-    """q(n) of `SphericalMatter.lines` at the distances `radius`."""
-    inside = radius.clamp_max(n)
-    return 0.5 * (n * (n**2 - inside.square()).sqrt() - inside.square() * (n / inside).acosh())
+def _pieces(radius: Tensor, count: int) -> tuple[Tensor, Iterator[tuple[Tensor, Tensor]]]:
+    """Pixels in the order of their distances `radius` ρ, and for n = 1 to `count` the q(n) of `SphericalMatter.lines`,
+    and its derivative by ρ, of those with ρ < n, in this order."""
+    near, order = radius.flatten().sort()
+
+    def pieces() -> Iterator[tuple[Tensor, Tensor]]:
+        for n, end in enumerate(torch.searchsorted(near, torch.arange(1.0, count + 1).double()).tolist(), 1):
+            inside = near[:end]
+            angle = inside * (n / inside).acosh()
+            yield 0.5 * (n * (n**2 - inside.square()).sqrt() - inside * angle), -angle
+
+    return order, pieces()
 
 
 class Sphere:

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate, pad
 
+from ..backends import coarse_work
 from ..checks import InputError, NoMatterError, require
 from ..inference import MARGIN, Decision, Score, select
 from ..optics.background import FLUX, ORDER, Background, Light, LightOptions
@@ -268,6 +269,7 @@ class _NotMade(Exception):
     """A kind that a run on coarse frames does not make."""
 
 
+@coarse_work()
 def decide_kind(task: Task, method: Method, null: str, other: str) -> Decision | None:
     """Which kind of result predicts unseen views, where `method` makes both on its way; null: the kind of its last one.
 
