@@ -144,6 +144,27 @@ def test_a_fit_that_begins_again_from_nothing_may_be_weakened_again(quiet):
     assert not fit._settled
 
 
+def test_half_a_prior_that_was_refused_is_not_tried_again(quiet):
+    """Where the last round leaves nothing, what the stronger prior found stands; of a fit that was stopped, too. A
+    foam was fitted for ever, with this prior and half of it in turns."""
+    stage = SmoothStage(SmoothVolume(QUICK))
+    start = stage.start(Task(quiet, RATIO), None)
+    fit, again = (stage.fit(Task(quiet, RATIO), start) for _ in range(2))
+    found, last = fit.voxels, len(fit.plan.legs()) - 1
+    more, empty = (found.with_parameters({"values": share * found.values}) for share in (2, 0))
+    problem = VolumeProblem(fit._frames_of(1), fit.plan.prior, 1.0)
+    fit._leg = last - 1
+    assert fit._weakened(found, 1.2, problem)
+    fit._leg = last - 1
+    assert not fit._weakened(more, 1.8, problem)
+    again.load(fit.state_dict())
+    for one in (fit, again):
+        one._leg = last
+        assert not one._weakened(empty, 2 * smooth_fit.EMPTY, problem)
+        assert torch.equal(one.voxels.values, found.values)
+        assert one.resolved()["prior_share"] == 1
+
+
 def test_next_to_nothing_is_nothing(quiet):
     """Or the prior, in units of its level, had no lower bound."""
     fit = SmoothStage(SmoothVolume()).fit(

@@ -157,6 +157,10 @@ class VolumeProblem:
 
         return misfit.value + prior, slope
 
+    def unexplained(self, u: Tensor) -> float:
+        """χ² a pixel of a volume u [Z, Y, X]."""
+        return 2 * self.frames(self.lines(u)).value / self.frames.count
+
     def penalty(self, u: Tensor) -> tuple[float, Callable[[Tensor], Tensor]]:
         """The prior of u, and what adds its gradient to that of the misfit."""
         prior, level = self.prior, self.level

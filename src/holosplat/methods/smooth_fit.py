@@ -139,7 +139,7 @@ class SmoothFit:
         self._volume = plan.begun
         self._rival: tuple[Tensor, float] | None = None
         self._level, self._more = 0.0, 0
-        self._strength, self._settled, self._kept = 1.0, False, False
+        self._strength, self._settled, self._kept, self._refused = 1.0, False, False, False
         self._stronger: tuple[VoxelGrid, float] | None = None
         self._descent: Descent | None = None
         self._begun = plan.begun.values[0]
@@ -230,7 +230,7 @@ class SmoothFit:
             return False
         falling = self._values[0] - descent.value > FALLING * abs(descent.value)
         assert isinstance(descent.problem, VolumeProblem)
-        return not falling or _unexplained(descent.problem, descent.u) <= EXPLAINED
+        return not falling or descent.problem.unexplained(descent.u) <= EXPLAINED
 
     def _begin(self, leg: Leg) -> bool:
         """Make the descent of a leg; False where there is nothing to be done."""
@@ -280,7 +280,7 @@ class SmoothFit:
         if self._kept and self._leg == len(self._legs) - 1:
             empty = torch.zeros_like(u)
             u = empty if problem(empty)[0] <= descent.value else u
-        unexplained = _unexplained(problem, u)
+        unexplained = problem.unexplained(u)
         if self._grown(problem, u):
             return
         if leg.kind == "from coarse" and unexplained > 1:
@@ -321,9 +321,13 @@ class SmoothFit:
 
     def _weakened(self, found: VoxelGrid, unexplained: float, problem: VolumeProblem) -> bool:
         """Whether the fit goes back to its start with half the prior. Else it goes on from `found`, or from what a
-        stronger prior found; not from one that explained next to nothing, as a nearly empty volume does."""
+        stronger prior found; not from one that explained next to nothing, as a nearly empty volume does. Half a prior
+        that was refused is not tried again: where nothing is left then, what the stronger one found stands."""
         self._volume = found
         if not bool(found.values.any()):
+            if self._refused and self._stronger:
+                self._volume = self._stronger[0]
+                return False
             if again := unexplained > EMPTY and self._strength > WEAKEST:
                 self._again(self._strength / 2 if self._kept else self._strength)
                 self._kept, self._settled = True, False
@@ -332,11 +336,12 @@ class SmoothFit:
         if not late or self._settled:
             return False
         if self._stronger is not None and unexplained - 1 > WORTH * (self._stronger[1] - 1):
-            (self._volume, _), self._strength, self._settled = self._stronger, 2 * self._strength, True
+            (self._volume, _), self._strength = self._stronger, 2 * self._strength
+            self._settled = self._refused = True
             return False
         self._settled = unexplained <= WEAKER or self._strength <= WEAKEST
         if not self._settled:
-            empty = _unexplained(problem, torch.zeros_like(found.values[0], device=problem.device))
+            empty = problem.unexplained(torch.zeros_like(found.values[0], device=problem.device))
             self._stronger = (found, unexplained) if unexplained - 1 < WORTH * (empty - 1) else None
             self._again(self._strength / 2)
         return not self._settled
@@ -346,8 +351,7 @@ class SmoothFit:
         self._leg, self._volume, self._rival, self._strength = 0, self.plan.begun, None, strength
 
     def _problem(self, frames: WhitenedFrames, factor: int, u: Tensor) -> VolumeProblem:
-        prior = self.plan.prior.weakened(self._strength)
-        prior = prior if factor == 1 else prior.on_larger_voxels(factor)
+        prior = self.plan.prior.weakened(self._strength).on_larger_voxels(factor)
         prior = replace(prior, levels=self.plan.levels.occupancies)
         problem = VolumeProblem(frames, prior, self._level, self.plan.backend)
         beside = self.plan.levels.absorbed(u.to(problem.device))
@@ -368,6 +372,7 @@ class SmoothFit:
             "strength": self._strength,
             "settled": self._settled,
             "kept": self._kept,
+            "refused": self._refused,
             "stronger": self._stronger and [self._stronger[0].state(), self._stronger[1]],
             "volume": self._volume.state(),
             "level": self._level,
@@ -382,10 +387,10 @@ class SmoothFit:
         self.step, self.seconds = int(state["step"]), float(state["seconds"])
         self._leg, self._level, self._strength = int(state["leg"]), float(state["level"]), float(state["strength"])
         self._more, self._values = int(state["more"]), [float(value) for value in state["values"]]
-        self._settled, self._kept, before = bool(state["settled"]), bool(state["kept"]), state["stronger"]
+        self._settled, self._kept, self._refused = (bool(state.get(name)) for name in ("settled", "kept", "refused"))
+        before, rival = state["stronger"], state["rival"]
         self._stronger = before and (VoxelGrid.from_state(before[0]), float(before[1]))
         self._volume = VoxelGrid.from_state(state["volume"])
-        rival = state["rival"]
         self._rival = rival and (rival[0].to(device(self.backend)), float(rival[1]))
         self._descent = None
         if state["descent"] is not None:
@@ -393,8 +398,3 @@ class SmoothFit:
             self._begun = state["descent"]["begun"]
             problem = self._problem(self._frames_of(factor), factor, self._begun)
             self._descent = Descent.again(problem, state["descent"], problem.device)
-
-
-def _unexplained(problem: VolumeProblem, u: Tensor) -> float:
-    """χ² a pixel of a volume."""
-    return 2 * problem.frames(problem.lines(u)).value / problem.frames.count
