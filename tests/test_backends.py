@@ -21,6 +21,7 @@ from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import Auto, Task
 from holosplat.methods.illumination import prepared
 from holosplat.methods.solve import settled
+from holosplat.methods.trials import decide_kind
 from holosplat.scan import Exposures
 from holosplat.specimens.red_cells import random_cells
 from holosplat.specimens.scene import MeshScene
@@ -160,12 +161,14 @@ def test_coarse_work_takes_one_thread_and_gives_the_others_back():
 
 @pytest.mark.usefixtures("three_threads")
 def test_decisions_are_coarse_work():
-    """The light, and the kind of matter, of two views, of which there is little to decide."""
+    """The light, the kind of matter and the kind of result of two views, of which there is little to decide."""
     threads = list[int]()
     views = Views.evenly_spaced(2, (16, 17), 1e-6)
     scene = MeshScene.of_one_material(random_cells(1, (16e-6,) * 3, 1), DeltaBeta(4e-7, 4e-10))
     scan = simulate(scene, Exposures.of(views, 20.0, 0.05), is_test=np.zeros(2, dtype=bool))
     task = Task(scan, MaterialPrior.unknown(), on_progress=lambda stage, part: threads.append(torch.get_num_threads()))
-    settled(Auto(), prepared(task, Auto()))
+    task = prepared(task, Auto())
+    settled(Auto(), task)
+    decide_kind(task, Auto().suited("levels"), "surfaces", "gaussians")
     assert set(threads) == {1}
     assert torch.get_num_threads() == 3

@@ -1,4 +1,4 @@
-"""Which implementation runs an operation: names, what each needs, and which operations it has.
+"""Which implementation runs an operation, and on how many threads: names, what each needs, and its operations.
 
 A backend is named once, where a fit starts; nothing falls back to another by itself. `auto` means `cuda` where a GPU
 can be used and `cpu` otherwise, never `reference`.

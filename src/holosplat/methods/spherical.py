@@ -99,23 +99,23 @@ class SphericalMatter(Unmoved):
         """
         bends, per_view = self._bends(), list[Tensor]()
         for radius, _ in self._seen(views):
-            order, pieces = _pieces(radius, len(bends))
-            lines = torch.zeros(len(order), dtype=torch.float64)
+            back, pieces = _pieces(radius, len(bends))
+            lines = torch.zeros(len(back), dtype=torch.float64)
             for bend, (ring, _) in zip(bends, pieces):
                 lines[: len(ring)].add_(ring, alpha=bend)
-            per_view.append(lines.float()[order.argsort()].reshape(radius.shape))
+            per_view.append(lines.float()[back].reshape(radius.shape))
         return torch.stack(per_view)
 
     def slopes(self, views: Views) -> list[Tensor]:
         """Derivatives [V, H, W] of `lines` by the centre along x, y, z, in units of the spacing, and by the values."""
         bends, per_view = self._bends(), list[Tensor]()
         for radius, way in self._seen(views):
-            order, pieces = _pieces(radius, len(bends))
-            moved, rings = (torch.zeros(n, len(order), dtype=torch.float64) for n in (1, len(bends) + 2))
+            back, pieces = _pieces(radius, len(bends))
+            moved, rings = (torch.zeros(n, len(back), dtype=torch.float64) for n in (1, len(bends) + 2))
             for n, (bend, (ring, angle)) in enumerate(zip(bends, pieces), 2):
                 moved[0, : len(ring)].add_(angle, alpha=bend)
                 rings[n, : len(ring)] = ring
-            found = torch.cat([moved, 2 * rings.diff(n=2, dim=0)]).float()[:, order.argsort()]
+            found = torch.cat([moved, 2 * rings.diff(n=2, dim=0)]).float()[:, back]
             moved, rest = found.reshape(-1, *radius.shape).split([1, len(bends)])
             per_view.append(torch.cat([moved * way.float(), rest]))
         return list(torch.stack(per_view, dim=1))
@@ -146,8 +146,8 @@ class SphericalMatter(Unmoved):
 
 
 def _pieces(radius: Tensor, count: int) -> tuple[Tensor, Iterator[tuple[Tensor, Tensor]]]:
-    """Pixels in the order of their distances `radius` ρ, and for n = 1 to `count` the q(n) of `SphericalMatter.lines`,
-    and its derivative by ρ, of those with ρ < n, in this order."""
+    """The place of each pixel in the order of the distances `radius` ρ; and for n = 1 to `count` the q(n) of
+    `SphericalMatter.lines`, and its derivative by ρ, of the pixels with ρ < n, in that order."""
     near, order = radius.flatten().sort()
 
     def pieces() -> Iterator[tuple[Tensor, Tensor]]:
@@ -156,7 +156,7 @@ def _pieces(radius: Tensor, count: int) -> tuple[Tensor, Iterator[tuple[Tensor, 
             angle = inside * (n / inside).acosh()
             yield 0.5 * (n * (n**2 - inside.square()).sqrt() - inside * angle), -angle
 
-    return order, pieces()
+    return order.argsort(), pieces()
 
 
 class Sphere:
