@@ -2,6 +2,7 @@
 
     python benchmarks/main_job.py --json                                  # 24 generated cells, seeds 101, 102, 103
     python benchmarks/main_job.py --preset auto --csv docs/data/main_job_idle.csv    # as reconstruct does it unasked
+    python benchmarks/main_job.py --preset auto --cases cells free --seeds 101 --csv docs/data/main_job_decisions.csv
     python benchmarks/main_job.py --cases ratio free poses noise nine plasma --surfaces     # harder ones, and surfaces
     python benchmarks/main_job.py --cases snapshot --meshes DIR/rbc*_049.vtk
     OMP_NUM_THREADS=1 python benchmarks/main_job.py --cases cells nine --surfaces --csv docs/data/main_job.csv
