@@ -261,7 +261,7 @@ def test_a_fit_that_finds_no_matter_predicts_frames_without_any(soft, monkeypatc
 
     monkeypatch.setattr(place, "solve_stages", nothing)
     found = TrialFits(task, first, {"levels": Auto().gaussians}).score("as measured", "levels", 0)
-    unseen = first.folds.split(0)[1]
+    unseen = first.for_fits.folds.split(0)[1]
     empty = Score.of(unseen.left(torch.ones(unseen.frames.shape, dtype=torch.float64)))
     np.testing.assert_allclose(found.powers, empty.powers)
 

@@ -102,6 +102,9 @@ FEWEST = 3
 """Views from which on some are set aside; of fewer, noise is added and taken off again (`Folds`)."""
 MANY, MOST = 6, 3
 """Views from which on two are set aside at a time, and folds at most: six views tell their scatter well enough."""
+TOGETHER = 4
+"""Views set aside at a time, at most, where fits are compared: as many tell their own scatter, which two do not, so
+that clear decisions take one fit of each candidate and not two."""
 EFFORT = 0.2
 """Part of the usual steps of a fit by which hypotheses are compared: all of them have as many."""
 CHECKED = 4
@@ -155,6 +158,8 @@ class Folds:
     binning: int = 1
     shape: tuple[int, int] | None = None
     """(H, W) of the frames before binning; None: as these."""
+    together: int = 1
+    """Views that are set aside at a time."""
 
     @classmethod
     def of(cls, train: Scan, binning: int | None = None, fewest: int = FEWEST) -> Folds:
@@ -163,14 +168,17 @@ class Folds:
         train = train.at_instant(len(train.instants) // 2) if train.is_series else train
         binning, views = binning or coarse_binning(train), len(train)
         by, most = (BY_FISSION, 1) if views < fewest else (BY_VIEWS, MOST if views >= MANY else views)
-        return cls(train.binned(binning), most, by, binning, train.views.shape)
+        return cls(train.binned(binning), most, by, binning, train.views.shape, 1 if views < MANY else 2)
+
+    @property
+    def of_third(self) -> Folds:
+        """The same with up to `TOGETHER` views set aside at a time, as many as leave two thirds of them."""
+        return replace(self, together=max(self.together, min(TOGETHER, len(self.scan) // 3)))
 
     def aside(self, fold: int) -> np.ndarray:
         """Numbers of the views that are not fitted. Folds share none; many views are not all predicted."""
-        views = len(self.scan)
-        together = 1 if views < MANY else 2
-        chosen = np.unique(np.arange(together * self.count) * views // (together * self.count))
-        return chosen[fold :: self.count]
+        views, chosen = len(self.scan), self.together * self.count
+        return np.unique(np.arange(chosen) * views // chosen)[fold :: self.count]
 
     def kept(self, fold: int) -> np.ndarray:
         """Numbers of the views that are fitted: all of them, where noise is split."""
@@ -235,6 +243,18 @@ class FirstVolumes:
         seen, unseen = self.folds.split(fold)
         volume = self.volume(fold, plain_light(seen.measured, LightOptions()))
         return Score.of(unseen.left(predictions(volume, unseen).double()))
+
+    @property
+    def for_fits(self) -> FirstVolumes:
+        """Those of folds of a third of the views (`Folds.of_third`), by which fits are compared; of the same material,
+        and of the same frames after phase retrieval."""
+        folds = self.folds.of_third
+        if self.folds.by == BY_FISSION or folds.together == self.folds.together:
+            return self
+        made = partial(replace, self, folds=folds, _material=self.material, _made={})
+        found = self.once(("for fits", self.prior), 0, made)
+        found.taken = self.taken
+        return found
 
     @property
     def _how(self) -> HolographicTV:

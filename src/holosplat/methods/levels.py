@@ -25,8 +25,10 @@ from ..representations import Stored, VoxelGrid
 from ..tables import with_entries
 from .cross_validation import BY_FISSION, EFFORT, FirstVolumes, is_plain, predictions, without_matter
 from .method import Method, Task, first_of_task, solve_stages
-from .trials import WITHOUT, Hypothesis, Trial, Trials, accepted, hypothesis_of, name_of
+from .smooth_fit import EMPTY, WORTH
+from .trials import FREE, WITHOUT, Hypothesis, Trial, Trials, accepted, hypothesis_of, name_of
 from .uncertain import Determined, likeliest_ratio
+from .volume import unexplained
 
 STAGE = "levels or continuous matter"
 SHOWN = "matter in first volumes"
@@ -127,15 +129,19 @@ class TrialFits:
     def __init__(
         self, task: Task, first: FirstVolumes, methods: Mapping[MatterKind, Method], whole: bool = False
     ) -> None:
-        self._task, self._first = task, first
+        self._task, self._whole, self._first = task, first, first.for_fits
         how = {"refine": 1, "join_missing": whole}
         self._methods = {kind: with_entries(method, how) for kind, method in methods.items()}
-        self._trials = Trials(first, task.light)
+        self._trials = Trials(self._first, task.light)
 
     def score(self, name: str, kind: MatterKind, fold: int, two: bool = False) -> Score:
         """Of the fit for a `kind` of matter (two: of two levels) to the fitted frames of a fold, under the hypothesis
-        that has this `name`, or as a rival of one (`trials.rivals`)."""
-        hypothesis = hypothesis_of(name)
+        that has this `name`, or as a rival of one (`trials.rivals`).
+
+        Unseen frames are in free light for no rival that is `refuted`: such light makes up for what a fit got wrong.
+        """
+        hypothesis, (before, _, more) = hypothesis_of(name), name.partition(FREE)
+        name = before if more and self.refuted(hypothesis, more, fold) else name
         found = self._fit(hypothesis, kind, fold, two)
         trial = self._trials.tried(hypothesis, fold)
         expected = torch.ones_like(trial.expected) if found is None else predictions(found, trial.unseen)
@@ -147,25 +153,40 @@ class TrialFits:
         return self._first.once(key, fold, lambda: self._fitted(hypothesis, kind, fold, two))
 
     def _fitted(self, hypothesis: Hypothesis, kind: MatterKind, fold: int, two: bool) -> Stored | None:
-        task, method, trial = self._task, self._methods[kind], self._trials.tried(hypothesis, fold)
-        task.on_progress(f"fit of coarse frames: {method.kind}", 0.0)
-        seen = replace(trial.seen, frames=trial.light.evened(torch.from_numpy(trial.seen.frames)).numpy())
-        prior = task.prior
-        if not (prior.fixes_ratio or two):
-            known = task.lit is not None
-            ratio = ratio_of_one(task, self._first).value if known else self._first.material.ratio
-            prior = prior.with_ratio(ratio)
-        fitted = replace(task, scan=seen, prior=prior, lit=trial.light, matter=kind, first=None)
-        first = first_of_task(fitted).at_ratio(self._first.material.ratio)
-        shared = is_plain(trial.light) and self._first.folds.by != BY_FISSION
-        fitted = replace(fitted, first=replace(first, part_of=(self._first, fold) if shared else None))
-        if fitted.bounded and not prior.materials and "continuous" in self._methods:
+        method, fitted = self._methods[kind], self._fitted_to(hypothesis, kind, fold, two)
+        fitted.on_progress(f"fit of coarse frames: {method.kind}", 0.0)
+        if fitted.bounded and not fitted.prior.materials and "continuous" in self._methods:
             volume = self._fit(hypothesis, "continuous", fold)
             fitted = replace(fitted, likeliest=volume if isinstance(volume, VoxelGrid) else None)
         try:
             return solve_stages(method, fitted)
         except NoMatterError:
             return None
+
+    def _fitted_to(self, hypothesis: Hypothesis, kind: MatterKind, fold: int, two: bool = False) -> Task:
+        """The fitted frames of a fold as a hypothesis has them."""
+        task, trial = self._task, self._trials.tried(hypothesis, fold)
+        seen = replace(trial.seen, frames=trial.light.evened(torch.from_numpy(trial.seen.frames)).numpy())
+        prior = task.prior
+        if not (prior.fixes_ratio or two):
+            known = task.lit is not None
+            ratio = ratio_of_one(task, self._whole).value if known else self._first.material.ratio
+            prior = prior.with_ratio(ratio)
+        fitted = replace(task, scan=seen, prior=prior, lit=trial.light, matter=kind, first=None)
+        first = first_of_task(fitted).at_ratio(self._first.material.ratio)
+        shared = is_plain(trial.light) and self._first.folds.by != BY_FISSION
+        return replace(fitted, first=replace(first, part_of=(self._first, fold) if shared else None))
+
+    def refuted(self, before: Hypothesis, more: str, fold: int) -> bool:
+        """Whether the fit of continuous matter under the hypothesis `before` leaves its own frames unexplained beyond
+        noise, of which that with `more` explains at least `WORTH`."""
+        left, after = (self._unexplained(one, fold) for one in (before, (*before, more)))
+        return left is not None and after is not None and left > EMPTY and after - 1 <= WORTH * (left - 1)
+
+    def _unexplained(self, hypothesis: Hypothesis, fold: int) -> float | None:
+        """χ² a pixel that the fit of continuous matter leaves of its own frames; None where no matter is found."""
+        found = self._fit(hypothesis, "continuous", fold)
+        return None if found is None else unexplained(self._fitted_to(hypothesis, "continuous", fold), found)
 
 
 def ratio_of_one(task: Task, first: FirstVolumes) -> Determined:

@@ -135,15 +135,13 @@ class SmoothFit:
     def __init__(self, plan: SmoothPlan) -> None:
         self.plan, self.backend = plan, resolve(plan.backend)
         self.step, self.seconds = 0, 0.0
-        self._legs, self._leg = plan.legs(), 0
-        self._volume = plan.begun
+        self._legs, self._leg, self._volume = plan.legs(), 0, plan.begun
         self._rival: tuple[Tensor, float] | None = None
         self._level, self._more = 0.0, 0
         self._strength, self._settled, self._kept, self._refused = 1.0, False, False, False
         self._stronger: tuple[VoxelGrid, float] | None = None
         self._descent: Descent | None = None
-        self._begun = plan.begun.values[0]
-        self._values: list[float] = []
+        self._begun, self._values = plan.begun.values[0], list[float]()
         self._frames: tuple[int, WhitenedFrames] | None = None
 
     @property
@@ -234,7 +232,7 @@ class SmoothFit:
 
     def _begin(self, leg: Leg) -> bool:
         """Make the descent of a leg; False where there is nothing to be done."""
-        frames = self._frames_of(leg.factor)
+        frames = self.frames_of(leg.factor)
         begun = self.plan.begun
         if leg.kind == "from start":
             if self._rival is None:
@@ -258,7 +256,7 @@ class SmoothFit:
     def _descent_from(self, u: Tensor, frames: WhitenedFrames, leg: Leg) -> Descent:
         """A descent that begins at u [Z, Y, X], where the backend computes."""
         self._begun = u
-        problem = self._problem(frames, leg.factor, u)
+        problem = self.problem(frames, leg.factor, u, self._level)
         return Descent(problem, u.to(problem.device), self._kept)
 
     def _end(self, leg: Leg, descent: Descent) -> None:
@@ -350,15 +348,17 @@ class SmoothFit:
         """Begin anew with a prior of that `strength`."""
         self._leg, self._volume, self._rival, self._strength = 0, self.plan.begun, None, strength
 
-    def _problem(self, frames: WhitenedFrames, factor: int, u: Tensor) -> VolumeProblem:
+    def problem(self, frames: WhitenedFrames, factor: int, u: Tensor, level: float) -> VolumeProblem:
+        """What a descent from u [Z, Y, X] minimises, on voxels of `factor` pixels, of matter of that level."""
         prior = self.plan.prior.weakened(self._strength).on_larger_voxels(factor)
         prior = replace(prior, levels=self.plan.levels.occupancies)
-        problem = VolumeProblem(frames, prior, self._level, self.plan.backend)
+        problem = VolumeProblem(frames, prior, level, self.plan.backend)
         beside = self.plan.levels.absorbed(u.to(problem.device))
         frames.absorbed = None if beside is None else problem.lines(beside)
         return problem
 
-    def _frames_of(self, factor: int) -> WhitenedFrames:
+    def frames_of(self, factor: int) -> WhitenedFrames:
+        """The frames on pixels `factor` times larger."""
         if self._frames is None or self._frames[0] != factor:
             self._frames = factor, self.plan.frames(factor)
         return self._frames[1]
@@ -396,5 +396,5 @@ class SmoothFit:
         if state["descent"] is not None:
             factor = self._legs[self._leg].factor
             self._begun = state["descent"]["begun"]
-            problem = self._problem(self._frames_of(factor), factor, self._begun)
+            problem = self.problem(self.frames_of(factor), factor, self._begun, self._level)
             self._descent = Descent.again(problem, state["descent"], problem.device)

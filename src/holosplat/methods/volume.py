@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar
 
 import torch
 
-from ..backends import Backend
+from ..backends import Backend, device
 from ..baselines import HolographicTV, holographic_tv
 from ..baselines.beyond import margins_of
 from ..baselines.material import DEFAULT, MaterialEstimate, level_of
@@ -144,6 +144,17 @@ class SmoothStage:
             not options.known_total, "known_total is of spherical matter, but the matter is of any shape; leave it."
         )
         return SmoothFit(plan)
+
+
+def unexplained(task: Task, found: Stored) -> float | None:
+    """χ² a pixel that a smooth volume leaves of the training frames of a task, with what is not known of their light
+    and with their noise; None of other objects."""
+    if not isinstance(found, VoxelGrid):
+        return None
+    fit, u = SmoothStage(SmoothVolume()).fit(task, found), found.values[0]
+    assert isinstance(fit, SmoothFit)  # spherical matter is no volume
+    u = u.to(device(fit.backend))
+    return fit.problem(fit.frames_of(1), 1, u, level=1.0).unexplained(u)
 
 
 def _beside(task: Task, start: VoxelGrid) -> Scan:
