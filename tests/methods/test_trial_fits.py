@@ -10,12 +10,14 @@ import torch
 
 from holosplat.beamline.simulate import simulate
 from holosplat.geometry import Views
-from holosplat.matter import DeltaBeta, MaterialPrior
+from holosplat.matter import DeltaBeta, KnownRatio, MaterialPrior
 from holosplat.methods import SmoothVolume, Task
-from holosplat.methods.cross_validation import predicted_frames
+from holosplat.methods.cross_validation import plain_light, predicted_frames
 from holosplat.methods.levels import TrialFits
 from holosplat.methods.method import first_of_task
 from holosplat.methods.trials import FREE, NULL, UNEVEN, Trials
+from holosplat.methods.uncertain import Determined
+from holosplat.optics.background import LightOptions
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.soft_matter import soft_cells
 
@@ -57,6 +59,18 @@ def test_folds_of_fits_set_a_third_of_the_views_aside(soft, views, together):
         assert first.for_fits.taken == first.taken
 
 
+def test_fits_have_the_ratio_that_was_found(soft):
+    """It is not looked for again beside fewer views."""
+    scan = soft[np.arange(12) % VIEWS]
+    task = Task(scan, MaterialPrior.unknown().signed(1), lit=plain_light(torch.from_numpy(scan.frames), LightOptions()))
+    first = first_of_task(task).at_ratio(MATTER.ratio)
+    found = Determined("delta_beta", 777.0, 700.0, 800.0, (50.0, 1e4), told=True)
+    first.once(("ratio", first.taken), 0, lambda: (found, None))
+    prior = TrialFits(task, first, {"continuous": SmoothVolume()})._fitted_to((), "continuous", 0).prior
+    assert isinstance(prior, KnownRatio)
+    assert prior.ratio == 777.0
+
+
 @pytest.mark.parametrize(("left", "after", "refuted"), [(3.0, 1.9, True), (3.0, 2.2, False), (1.15, 0.5, False)])
 def test_a_volume_that_leaves_its_own_frames_unexplained_is_no_rival_in_free_light(
     soft, monkeypatch, left, after, refuted
@@ -88,3 +102,10 @@ def test_frames_in_uneven_light_refute_a_volume_in_even_light(soft):
         roots = 2 * (predicted_frames(seen.exposures, found).double().sqrt() - frames.sqrt()) / white
         plain = float(roots.square().mean())
         assert 0.3 < left / plain < 1  # what voxels cannot show counts as noise, too
+
+
+def test_spherical_matter_has_a_residual_too(soft):
+    """Its fit ends as a volume."""
+    task = Task(uneven(soft), PRIOR.about_a_point())
+    fits = TrialFits(task, first_of_task(task), {"continuous": SmoothVolume()})
+    assert fits.refuted((), UNEVEN, 0)

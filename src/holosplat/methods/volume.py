@@ -123,6 +123,14 @@ class SmoothStage:
 
     def fit(self, task: Task, start: Stored) -> SmoothFit | SphericalFit:
         """The fit to the training frames, from larger voxels on."""
+        plan, known_total = self.plan(task, start), self.options.known_total
+        if task.prior.spherical:
+            return SphericalFit(plan.frames(1), plan.begun, plan.backend, task.prior.lower, known_total)
+        require(not known_total, "known_total is of spherical matter, but the matter is of any shape; leave it.")
+        return SmoothFit(plan)
+
+    def plan(self, task: Task, start: Stored) -> SmoothPlan:
+        """What is fitted to, and how."""
         assert isinstance(start, VoxelGrid)
         options, factor = self.options, binning(task.scan, self.options.max_voxels)
         noise, backend = task.noise.binned(factor), options.volume.backend
@@ -137,23 +145,14 @@ class SmoothStage:
         how = (prior, options.coarser, options.rounds, options.iterations, faint, options.loose)
         # one density as a level lost 4 % of the total of balls at 500 photons a pixel, and gained nothing
         known = task.prior.materials if len(task.prior.materials) > 1 else ()
-        plan = SmoothPlan(scan, start, noise, task.prior.fixes_ratio, light, *how, backend, known)
-        if task.prior.spherical:
-            return SphericalFit(plan.frames(1), start, backend, task.prior.lower, options.known_total)
-        require(
-            not options.known_total, "known_total is of spherical matter, but the matter is of any shape; leave it."
-        )
-        return SmoothFit(plan)
+        return SmoothPlan(scan, start, noise, task.prior.fixes_ratio, light, *how, backend, known)
 
 
-def unexplained(task: Task, found: Stored) -> float | None:
-    """χ² a pixel that a smooth volume leaves of the training frames of a task, with what is not known of their light
-    and with their noise; None of other objects."""
-    if not isinstance(found, VoxelGrid):
-        return None
-    fit, u = SmoothStage(SmoothVolume()).fit(task, found), found.values[0]
-    assert isinstance(fit, SmoothFit)  # spherical matter is no volume
-    u = u.to(device(fit.backend))
+def unexplained(task: Task, found: Stored) -> float:
+    """χ² a pixel that a volume leaves of the training frames of a task, in units of their noise and of what is not
+    known of their light."""
+    fit = SmoothFit(SmoothStage(SmoothVolume()).plan(task, found))
+    u = fit.voxels.values[0].to(device(fit.backend))
     return fit.problem(fit.frames_of(1), 1, u, level=1.0).unexplained(u)
 
 
