@@ -138,7 +138,7 @@ def test_a_fit_that_begins_again_from_nothing_may_be_weakened_again(quiet):
     stage = SmoothStage(SmoothVolume(QUICK))
     fit = stage.fit(task, stage.start(task, None))
     empty = fit.voxels.with_parameters({"values": torch.zeros_like(fit.voxels.values)})
-    problem = VolumeProblem(fit.frames_of(1), fit.plan.prior, 1.0)
+    problem = VolumeProblem(fit._frames_of(1), fit.plan.prior, 1.0)
     fit._settled = True
     assert fit._weakened(empty, 2 * smooth_fit.EMPTY, problem)
     assert not fit._settled
@@ -152,7 +152,7 @@ def test_half_a_prior_that_was_refused_is_not_tried_again(quiet):
     fit, again = (stage.fit(Task(quiet, RATIO), start) for _ in range(2))
     found, last = fit.voxels, len(fit.plan.legs()) - 1
     more, empty = (found.with_parameters({"values": share * found.values}) for share in (2, 0))
-    problem = VolumeProblem(fit.frames_of(1), fit.plan.prior, 1.0)
+    problem = VolumeProblem(fit._frames_of(1), fit.plan.prior, 1.0)
     fit._leg = last - 1
     assert fit._weakened(found, 1.2, problem)
     fit._leg = last - 1

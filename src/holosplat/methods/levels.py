@@ -28,7 +28,7 @@ from .method import Method, Task, first_of_task, solve_stages
 from .smooth_fit import EMPTY, WORTH
 from .trials import FREE, WITHOUT, Hypothesis, Trial, Trials, accepted, hypothesis_of, name_of
 from .uncertain import Determined, likeliest_ratio
-from .volume import unexplained
+from .volume import SmoothVolume, unexplained
 
 STAGE = "levels or continuous matter"
 SHOWN = "matter in first volumes"
@@ -185,8 +185,9 @@ class TrialFits:
 
     def _unexplained(self, hypothesis: Hypothesis, fold: int) -> float | None:
         """χ² a pixel that the fit of continuous matter leaves of its own frames; None where no matter is found."""
-        found = self._fit(hypothesis, "continuous", fold)
-        return None if found is None else unexplained(self._fitted_to(hypothesis, "continuous", fold), found)
+        found, method = self._fit(hypothesis, "continuous", fold), self._methods["continuous"]
+        assert isinstance(method, SmoothVolume)
+        return None if found is None else unexplained(self._fitted_to(hypothesis, "continuous", fold), found, method)
 
 
 def ratio_of_one(task: Task, first: FirstVolumes) -> Determined:

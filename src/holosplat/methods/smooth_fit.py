@@ -135,13 +135,15 @@ class SmoothFit:
     def __init__(self, plan: SmoothPlan) -> None:
         self.plan, self.backend = plan, resolve(plan.backend)
         self.step, self.seconds = 0, 0.0
-        self._legs, self._leg, self._volume = plan.legs(), 0, plan.begun
+        self._legs, self._leg = plan.legs(), 0
+        self._volume = plan.begun
         self._rival: tuple[Tensor, float] | None = None
         self._level, self._more = 0.0, 0
         self._strength, self._settled, self._kept, self._refused = 1.0, False, False, False
         self._stronger: tuple[VoxelGrid, float] | None = None
         self._descent: Descent | None = None
-        self._begun, self._values = plan.begun.values[0], list[float]()
+        self._begun = plan.begun.values[0]
+        self._values: list[float] = []
         self._frames: tuple[int, WhitenedFrames] | None = None
 
     @property
@@ -232,14 +234,13 @@ class SmoothFit:
 
     def _begin(self, leg: Leg) -> bool:
         """Make the descent of a leg; False where there is nothing to be done."""
-        frames = self.frames_of(leg.factor)
         begun = self.plan.begun
         if leg.kind == "from start":
             if self._rival is None:
                 return False
-            self._descent = self._descent_from(begun.values[0], frames, leg)
+            self._descent = self._descent_from(begun.values[0], leg)
             return True
-        grid = begun.grid if leg.factor == 1 else Grid.of_views(frames.field)
+        grid = begun.grid if leg.factor == 1 else Grid.of_views(self._frames_of(leg.factor).field)
         if self._volume.grid != grid:
             self._volume = self._volume.resampled(grid)
         u = self._volume.values[0]
@@ -250,13 +251,13 @@ class SmoothFit:
         if leg.kind == "from even":
             u = torch.full_like(u, self.plan.faint * plateau(u.abs()))
         self._level = leg.loose * plateau(u.abs())
-        self._descent = self._descent_from(u, frames, leg)
+        self._descent = self._descent_from(u, leg)
         return True
 
-    def _descent_from(self, u: Tensor, frames: WhitenedFrames, leg: Leg) -> Descent:
+    def _descent_from(self, u: Tensor, leg: Leg) -> Descent:
         """A descent that begins at u [Z, Y, X], where the backend computes."""
         self._begun = u
-        problem = self.problem(frames, leg.factor, u, self._level)
+        problem = self.problem(leg.factor, u, self._level)
         return Descent(problem, u.to(problem.device), self._kept)
 
     def _end(self, leg: Leg, descent: Descent) -> None:
@@ -348,17 +349,16 @@ class SmoothFit:
         """Begin anew with a prior of that `strength`."""
         self._leg, self._volume, self._rival, self._strength = 0, self.plan.begun, None, strength
 
-    def problem(self, frames: WhitenedFrames, factor: int, u: Tensor, level: float) -> VolumeProblem:
+    def problem(self, factor: int, u: Tensor, level: float) -> VolumeProblem:
         """What a descent from u [Z, Y, X] minimises, on voxels of `factor` pixels, of matter of that level."""
         prior = self.plan.prior.weakened(self._strength).on_larger_voxels(factor)
         prior = replace(prior, levels=self.plan.levels.occupancies)
-        problem = VolumeProblem(frames, prior, level, self.plan.backend)
+        problem = VolumeProblem(self._frames_of(factor), prior, level, self.plan.backend)
         beside = self.plan.levels.absorbed(u.to(problem.device))
-        frames.absorbed = None if beside is None else problem.lines(beside)
+        problem.frames.absorbed = None if beside is None else problem.lines(beside)
         return problem
 
-    def frames_of(self, factor: int) -> WhitenedFrames:
-        """The frames on pixels `factor` times larger."""
+    def _frames_of(self, factor: int) -> WhitenedFrames:
         if self._frames is None or self._frames[0] != factor:
             self._frames = factor, self.plan.frames(factor)
         return self._frames[1]
@@ -396,5 +396,5 @@ class SmoothFit:
         if state["descent"] is not None:
             factor = self._legs[self._leg].factor
             self._begun = state["descent"]["begun"]
-            problem = self.problem(self.frames_of(factor), factor, self._begun, self._level)
+            problem = self.problem(factor, self._begun, self._level)
             self._descent = Descent.again(problem, state["descent"], problem.device)

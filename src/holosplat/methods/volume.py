@@ -148,12 +148,12 @@ class SmoothStage:
         return SmoothPlan(scan, start, noise, task.prior.fixes_ratio, light, *how, backend, known)
 
 
-def unexplained(task: Task, found: Stored) -> float:
+def unexplained(task: Task, found: Stored, options: SmoothVolume) -> float:
     """χ² a pixel that a volume leaves of the training frames of a task, in units of their noise and of what is not
     known of their light."""
-    fit = SmoothFit(SmoothStage(SmoothVolume()).plan(task, found))
+    fit = SmoothFit(SmoothStage(options).plan(task, found))
     u = fit.voxels.values[0].to(device(fit.backend))
-    return fit.problem(fit.frames_of(1), 1, u, level=1.0).unexplained(u)
+    return fit.problem(1, u, level=1.0).unexplained(u)
 
 
 def _beside(task: Task, start: VoxelGrid) -> Scan:
