@@ -84,7 +84,7 @@ def test_its_settings_run_today(run, tmp_path):
     old, new = (load_reconstruction(RunFolder(folder)).object for folder in (run, tmp_path / "new"))
     assert new.described == old.described
     a, b = (obj.voxelise(Grid.of_views(read_scan(SCAN).views)).delta for obj in (old, new))
-    assert np.linalg.norm(a - b) < 1e-3 * np.linalg.norm(a)
+    assert np.linalg.norm(a - b) < 2.5e-3 * np.linalg.norm(a)  # phase retrieval begins otherwise
 
 
 def test_it_is_not_resumed(run, tmp_path):

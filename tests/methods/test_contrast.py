@@ -145,7 +145,7 @@ def test_a_crack_is_a_hole_that_fitted_frames_tell():
     drawn = kind.drawn(Substances(air, None, medium), 3)
     views = Views.evenly_spaced(8, shape=(44, 44), pixel_size=PIXEL)
     scan = simulate(
-        drawn.scene, Exposures.of(views, 20.0, 0.1), photons_per_pixel=3000.0, seed=1, is_test=np.zeros(8, bool)
+        drawn.scene, Exposures.of(views, 20.0, 0.1), photons_per_pixel=1000.0, seed=1, is_test=np.zeros(8, bool)
     )
     task = Task(scan, MaterialPrior.unknown())
     how = {"fitted": partial(_fitted, task.light)}

@@ -67,11 +67,13 @@ def test_rounds_of_agreement_in_noise_are_more_and_smoother():
 
 
 def test_a_volume_that_agrees_with_noisy_frames_is_nearer_to_the_truth():
+    """The volume before had an error of 0.24 where phase retrieval trusted noise at low frequencies, and 0.19 after."""
     noisy, errors = task_of(1000.0), list[float]()
     for how in (HolographicTV(), HolographicTV().in_noise()):
         found, _ = holographic_tv(noisy.scan, MATTER, replace(how, refine=1), quiet)
         errors.append(error(found.numpy()))
-    assert errors[1] < 0.8 * errors[0]
+    assert errors[0] < 0.21
+    assert errors[1] < min(0.9 * errors[0], 0.175)
 
 
 # --- which way is gone --------------------------------------------------------------------------------------

@@ -347,3 +347,23 @@ def test_bad_numbers_of_options():
         Projections(feedback=-1.0)
     assert tikhonov is RETRIEVALS["tikhonov"]
     assert admm is RETRIEVALS["admm"]
+
+
+@pytest.mark.parametrize(("radius_px", "count", "lambda_z", "most"), [(2.5, 40, 0.6, 0.2), (14.0, 2, 25.0, 0.1)])
+def test_bounds_tell_what_noise_hides_of_a_frame(radius_px, count, lambda_z, most):
+    """Of many small balls, bounds know the lowest frequencies better than noisy frames do; of thick ones, frames do."""
+    where, delta = exposures((61, 84), at(lambda_z)), 0.4 / (K * radius_px * PITCH)
+    places = np.random.default_rng(4).uniform(-1, 1, (count, 2)) * (26.0, 18.0)
+
+    def balls(views: Views) -> Tensor:
+        x, y = pixels(views)
+        inside = ((radius_px * PITCH) ** 2 - _squared_distance(x, y, tuple(place)) for place in places)
+        return sum((2 * one.clamp_min(0).sqrt() for one in inside), start=torch.zeros(views.shape, dtype=DOUBLE))
+
+    truth, frames = taken(balls, where, delta, delta / 2800)
+    true, seen = truth * K * delta, (noisy(frames, 1e4), where, 1 / 2800, None)
+    found, once = bounded_estimate(*seen), bounded_estimate(*seen, lacking=True)
+    assert relative_error(found.phase, true) < min(most, 0.9 * relative_error(once.phase, true))
+    assert once.lacks == 0
+    if radius_px < 5:  # where noise, and not the linear model, is what hides the phase
+        assert float(found.lacks) == pytest.approx(float((once.phase - true).square().mean()), rel=0.3)

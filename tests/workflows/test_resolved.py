@@ -37,7 +37,7 @@ def scan(photons: float | None) -> Scan:
 @pytest.mark.parametrize("photons", [None, 300.0])
 def test_the_weights_that_noise_and_views_make_are_kept(tmp_path, photons):
     folder = RunFolder(tmp_path / "run")
-    reconstruct(scan(photons), MaterialPrior.known(CELL), QUICK, folder=folder)
+    reconstruct(scan(photons), MaterialPrior.known(CELL), QUICK, folder=folder, matter="levels")
     config = json.loads(folder.config.read_text())
     found, asked = config["resolved"]["fit"], QUICK.fit.objective
     scale = 29 / 100 * sqrt(8 / 3)  # depth of the field; the fourth view is held out

@@ -79,6 +79,8 @@ class HolographicTV:
     two_sided: bool = False
     """Whether the occupancy may be below zero, of matter on both sides of its medium; a run takes what is known of the
     matter, or decided."""
+    lacking: bool = False
+    """Whether frames show what a result lacks, such as frames over those of known bodies (`bounded_estimate`)."""
     still_light: int = 0
     """Half waves across a frame up to which light that is the same in all frames, such as what a missing flat field has
     left, is unknown and found beside the matter (0: there is none). Its mean is taken to be right, for in few views it
@@ -138,7 +140,7 @@ def retrieved(
     """Thickness [V, H, W] of `material` [m], which phase retrieval finds in every view by itself; leaves: whether
     matter goes on above and below the frames, and at their sides."""
     backend, noise = resolve(options.backend), correlated(light)
-    how = Tikhonov(iterations=options.retrieval, backend=backend, leaves=leaves, noise=noise)
+    how = Tikhonov(iterations=options.retrieval, backend=backend, leaves=leaves, noise=noise, lacking=options.lacking)
     known = {"options": how, "missing": scan.gaps, "on_progress": partial(on_progress, "phase retrieval")}
     known["two_sided"] = options.two_sided
     return tikhonov(torch.from_numpy(scan.frames), scan.exposures, *material, **known)

@@ -220,12 +220,16 @@ class BodyTracker:
         self.decisions.append(decision)
         return found
 
-    def look(self, frames: Scan, level: float = 1.0, network: Guess | None = None) -> list[list[Detection]]:
+    def look(
+        self, frames: Scan, level: float = 1.0, network: Guess | None = None, lacking: bool = False
+    ) -> list[list[Detection]]:
         """The bodies that each time of `frames` shows by itself.
 
-        level: factor of the occupancy at the surface; network: what guesses the volumes.
+        level: factor of the occupancy at the surface; network: what guesses the volumes; lacking: whether `frames` are
+        over those of known bodies.
         """
-        how = replace(self.options.sightings, level=level * self.options.sightings.level)
+        how = self.options.sightings
+        how = replace(how, level=level * how.level, volume=replace(how.volume, lacking=lacking))
         times, found = frames.instants, list[list[Detection]]()
         with self.run.timed("sightings"):
             for t in range(len(times)):
@@ -311,7 +315,7 @@ class BodyTracker:
             new = self._search_poses(self.options.body, bodies.basis, bodies)
             own = [] if new is None else apart(new, bodies, times)
             return joined(bodies, only(new, own)) if new is not None and own else None
-        found = self.look(beside(self.train, bodies, self.oversample), self.options.fainter)
+        found = self.look(beside(self.train, bodies, self.oversample), self.options.fainter, lacking=True)
         try:
             new = first_paths(found, times, bodies.basis, bodies.unit_length, self.material, self.options.links)
         except InputError:  # no track

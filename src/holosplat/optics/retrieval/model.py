@@ -64,6 +64,8 @@ class Regularised(WaveOptions):
     """Whether matter goes on above and below the frames, and at their sides (`bounded_estimate`)."""
     prior: Prior | None = None
     """Expected power of the phase (default: the one that the frames show)."""
+    lacking: bool = False
+    """Whether frames show what a result lacks (`bounded_estimate`)."""
 
 
 class WaveModel:
@@ -72,11 +74,10 @@ class WaveModel:
     The raster is the frame padded by the fringes' reach, `oversample` times finer; `support` [V, H, W] marks the
     samples where matter may be: where the estimate has matter, and beyond the frame's border where the estimate touches
     it. float32 frames are computed by `backend`, float64 ones by `reference`. `phase` is the estimate to start from,
-    `missing` [V, h, w] marks pixels without a value, which have no part in the misfit,
-    `ratio` the matter's β/δ at the frames' energy, which is one, `sign` that of its δ (-1: holes, which advance waves),
-    `two_sided` whether phases may be negative,
-    and `strongest` [V, 1, 1] about the curvature of the strongest frequency: 1 where fringes are seen, and far less
-    where hardly any are.
+    `lacks` [V] the mean square of what it lacked at first, `missing` [V, h, w] marks pixels without a value, which have
+    no part in the misfit, `ratio` the matter's β/δ at the frames' one energy, `sign` that of its δ (-1: holes, which
+    advance waves), `two_sided` whether phases may be negative, and `strongest` [V, 1, 1] about the curvature of
+    the strongest frequency: 1 where fringes are seen, and far less where hardly any are.
     """
 
     def __init__(
@@ -92,8 +93,9 @@ class WaveModel:
         sign: float = 1.0,
         missing: Gaps = None,
         two_sided: bool = False,
+        lacking: bool = False,
     ) -> None:
-        told = {"missing": missing, "two_sided": two_sided}
+        told = {"missing": missing, "two_sided": two_sided, "lacking": lacking}
         estimate = bounded_estimate(frames, exposures, ratio, noise, leaves, prior, sign, **told)
         self.sign, self.least = sign, -math.inf if two_sided else 0.0
         energy = exposures.one_energy("the wave model of a phase retrieval")
@@ -120,6 +122,7 @@ class WaveModel:
         self.spectra = spectra(frames, exposures, h, self.raster, noise, MODEL_ERROR, prior, missing=missing)
         self.strongest = self.spectra.poses.sum(column(sensitivity(exposures, ratio) ** 2))
         self.support, self.phase = self._spread(estimate)
+        self.lacks = estimate.lacks
 
     def _spread(self, estimate: Estimate) -> tuple[Tensor, Tensor]:
         """The estimate's support and phase on the waves' raster, the phase with the same means over pixels."""
@@ -201,14 +204,14 @@ def view_by_view(
     """
     (delta, beta), (missing, two_sided, on_progress) = material, beside
     frames = checked(frames, exposures, delta)
-    leaves, prior = (options.leaves, options.prior) if isinstance(options, Regularised) else (NOWHERE, None)
+    how = options if isinstance(options, Regularised) else Regularised()
     found, done = torch.empty_like(frames), 0
     for index in alike(exposures):
         start, share = done / len(exposures), len(index) / len(exposures)
         gaps = None if missing is None else missing[index]
         seen = (frames[index], exposures[index], beta / delta, part_of(options.noise, index))
-        told = {"sign": math.copysign(1.0, delta), "missing": gaps, "two_sided": two_sided}
-        model = WaveModel(*seen, options.backend, leaves, prior, **told)
+        told = {"sign": math.copysign(1.0, delta), "missing": gaps, "two_sided": two_sided, "lacking": how.lacking}
+        model = WaveModel(*seen, options.backend, how.leaves, how.prior, **told)
         part = model.thickness(solve(model, lambda f, a=start, b=share: on_progress(a + b * f)), delta)
         found[index] = part.to(frames.device, frames.dtype)
         done += len(index)

@@ -87,13 +87,16 @@ def tikhonov(options: Tikhonov, model: WaveModel, on_progress: Advance) -> Tenso
 def penalty_weights(model: WaveModel, weight: float) -> Tensor:
     """R [V, H, W//2 + 1]: variance of the roots over the expected power, in the unit of the misfit's curvature.
 
-    The power has the shape of the prior and the total power of the estimate. A power that only explains a frame's
-    contrast would be too small at the lowest frequencies of compact matter, and the penalty would shrink the matter.
+    The power has the shape of the prior and the total power of the estimate and of what it lacks: the mean of a square
+    is that of the mean and its variance. A power that only explains a frame's contrast would be too small at the lowest
+    frequencies of compact matter, and the penalty would shrink the matter.
     """
     known = model.spectra
     seen = squared_frequency(model.raster) <= (0.5 / model.exposures.views.pixel_size) ** 2
     found = torch.fft.rfft2(model.phase.cpu().double()).abs().square() / math.prod(model.raster.shape)
-    scale = found[:, seen].mean(dim=1) / model.oversample**2 / known.power[:, seen].mean(dim=1)
+    inside = math.prod(model.exposures.views.shape) * model.oversample**2 / math.prod(model.raster.shape)
+    expected = found[:, seen].mean(dim=1) / model.oversample**2 + inside * model.lacks
+    scale = expected / known.power[:, seen].mean(dim=1)
     variance = 0.25 * known.poses.mean(known.unexplained) / scale.clamp_min(TINY)[:, None, None]
     stiffness = (weight * variance / known.power).minimum(STIFFEST * model.strongest)
     return stiffness / model.oversample**2

@@ -8,7 +8,7 @@ of point-spread function and pixel. Rasters are real ones: frequencies are those
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -214,24 +214,39 @@ def spectra(
     """
     known = with_gaps(frames, missing)
     level, grain = _levels(known, exposures, raster, noise)
-    contrast = contrast_level(known)
-    all_noise = noise.level if isinstance(noise, NoiseModel) else level
+    error = (level.square() + (model_error * contrast_level(known)).square() + TINY).sqrt()
+    found = Spectra(h, h, level, error, SharedPoses(exposures), grain)
+    return with_power(found, known, exposures, raster, noise, prior, leaks)
+
+
+def with_power(
+    known: Spectra,
+    frames: Tensor,
+    exposures: Exposures,
+    raster: Raster,
+    noise: Noise,
+    prior: Prior | None = None,
+    leaks: bool = True,
+) -> Spectra:
+    """`known` with the power of the phase that `frames` show, where pixels without a value are NaN, and its leak."""
+    contrast, h = contrast_level(frames), known.response
+    all_noise = noise.level if isinstance(noise, NoiseModel) else known.noise
     signal = (contrast.square() - all_noise.square()).clamp_min(LEAST_SIGNAL * contrast.square() + TINY)
     f2, field = squared_frequency(raster), math.prod(exposures.views.shape) * exposures.views.pixel_size**2
-    error = (level.square() + (model_error * contrast).square() + TINY).sqrt()
     if prior is None:
-        corner, decay = (each[:, None, None] for each in _shown(frames, exposures, h, raster, error, noise))
+        shown = _shown(frames.nan_to_num(nan=1.0), exposures, h, raster, known.error, noise)
+        corner, decay = (each[:, None, None] for each in shown)
     else:
         corner, decay = prior.corner, prior.decay
     shape = (f2 * field + corner**2) ** -decay
     seen = f2 <= (0.5 / exposures.views.pixel_size) ** 2
     explained = (h.square() * shape)[:, seen].mean(dim=1)
-    power, poses = shape * (signal / explained)[:, None, None], SharedPoses(exposures)
+    power, poses = shape * (signal / explained)[:, None, None], known.poses
     if poses.any:  # frames that hardly show the phase hardly say what its power is
-        told = (signal / error.square())[:, None, None]
+        told = (signal / known.error.square())[:, None, None]
         power = poses.sum(told * power) / poses.sum(told)
     leak = _changes(h, raster, exposures).square() * power if leaks else 0.0
-    return Spectra(h, power, level, error, poses, grain, leak)
+    return replace(known, power=power, leak=leak)
 
 
 def _changes(h: Tensor, raster: Raster, exposures: Exposures) -> Tensor:
