@@ -367,3 +367,21 @@ def test_bounds_tell_what_noise_hides_of_a_frame(radius_px, count, lambda_z, mos
     assert once.lacks == 0
     if radius_px < 5:  # where noise, and not the linear model, is what hides the phase
         assert float(found.lacks) == pytest.approx(float((once.phase - true).square().mean()), rel=0.3)
+
+
+def test_bounds_tell_nothing_of_matter_that_edges_cut():
+    """A rod through the frame, from one edge to the other."""
+    where, radius = exposures((61, 84), at(3.0)), 8 * PITCH
+    delta = 1.0 / (K * 2 * radius)
+
+    def rod(views: Views) -> Tensor:
+        x, y = pixels(views)
+        return 2 * (radius**2 - (x + 0.3 * y) ** 2).clamp_min(0).sqrt()
+
+    truth, frames = taken(rod, where, delta, delta / 2800)
+    seen = noisy(frames, 1e4), where, 1 / 2800, None
+    once, unknown, within = (
+        relative_error(bounded_estimate(*seen, **told).phase, truth * K * delta)
+        for told in ({"lacking": True}, {}, {"leaves": (False, False)})
+    )
+    assert unknown < 1.02 * once < within

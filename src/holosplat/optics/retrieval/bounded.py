@@ -64,7 +64,7 @@ def bounded_estimate(
     exposures: Exposures,
     ratio: float,
     noise: Noise,
-    leaves: Leaves = NOWHERE,
+    leaves: Leaves | None = None,
     prior: Prior | None = None,
     sign: float = 1.0,
     *,
@@ -80,17 +80,19 @@ def bounded_estimate(
     matter (a support found anew in every round: the "shrinkwrap" of Marchesini et al. 2003). Of that, `W` weighs what
     the frames say by the power expected of the phase, and then, in as many rounds more, by that of what [φ] lacks:
     bounds know low frequencies that noise hides better than the frames do. They know nothing of matter that the frame's
-    edges cut: by the share of the strongest phase with which it gets there, the power of all phase is added.
+    edges cut: where it may be, by the share of the strongest phase that is at the edges, the power of all is added.
 
     Frames of one pose at several distances (`SharedPoses`) have one estimate, by all of them.
     missing: pixels [V, H, W] bool without a value (`completed`). two_sided: whether phases may be negative.
     leaves: whether matter goes on above and below the frame, and at its sides. Air there would take a soft body away
     far into the frame, for only the bends of its shadow are seen; it may then go on, and ends as smoothly as it can.
+    None: nobody knows.
     prior: expected power (default: the one that the frames show, or `FIXED` where matter leaves them). lacking: whether
     frames show what a result lacks, such as frames over those of known bodies, so that their power is the one of that.
     """
     contrast, crop = surrounded(frames, exposures)
     raster = Raster((contrast.shape[-2], contrast.shape[-1]), exposures.views.pixel_size)
+    unknown, leaves = leaves is None, leaves or NOWHERE
     h, prior = response(exposures, ratio, raster), prior or (FIXED if any(leaves) else None)
     known = spectra(frames, exposures, h, raster, noise, MODEL_ERROR, prior, leaks=prior is None, missing=missing)
     contrast = completed(contrast, missing, crop, known)
@@ -102,7 +104,7 @@ def bounded_estimate(
         if again:
             left = (contrast + sign * filtered(matter, h))[crop] + 1
             whole, known = known, with_power(known, left, exposures, raster, noise)
-            cut = _cut(matter[crop])
+            cut = _cut(matter[crop]) if unknown else torch.zeros(())
             known = replace(known, power=known.power + cut * whole.power, leak=known.leak + cut * whole.leak)
         if noise is None:
             doubtful = known.poses.sum(fine.square() * known.inverse.square().mean(dim=(1, 2))).sqrt()

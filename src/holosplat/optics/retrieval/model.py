@@ -60,8 +60,8 @@ class Regularised(WaveOptions):
     """Steps, each one evaluation of the wave optics and its gradient."""
     weight: Weight = 1.0
     """Weight of the regularisation; 1 is the Bayesian weight under the method's assumptions on the matter."""
-    leaves: Leaves = NOWHERE
-    """Whether matter goes on above and below the frames, and at their sides (`bounded_estimate`)."""
+    leaves: Leaves | None = None
+    """Whether matter goes on above and below the frames, and at their sides (default: nobody knows it)."""
     prior: Prior | None = None
     """Expected power of the phase (default: the one that the frames show)."""
     lacking: bool = False
@@ -87,7 +87,7 @@ class WaveModel:
         ratio: float,
         noise: Noise,
         backend: str = "cpu",
-        leaves: Leaves = NOWHERE,
+        leaves: Leaves | None = None,
         prior: Prior | None = None,
         *,
         sign: float = 1.0,
@@ -118,7 +118,7 @@ class WaveModel:
             (exposures.views.shape, (my, mx), self.oversample),
             frames.dtype,
         ).to(self.frames.device)
-        h, prior = response(exposures, ratio, self.raster), prior or (FIXED if any(leaves) else None)
+        h, prior = response(exposures, ratio, self.raster), prior or (FIXED if any(leaves or NOWHERE) else None)
         self.spectra = spectra(frames, exposures, h, self.raster, noise, MODEL_ERROR, prior, missing=missing)
         self.strongest = self.spectra.poses.sum(column(sensitivity(exposures, ratio) ** 2))
         self.support, self.phase = self._spread(estimate)
