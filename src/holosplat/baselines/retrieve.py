@@ -63,7 +63,7 @@ def retrieve(
         >>> found = hs.retrieve(scan.frames, scan.exposures, water)
         >>> _, D = scene.project(views)
         >>> print(f"{1e6 * found.thickness.max():.1f} µm, true {1e6 * D.max() / water.delta:.1f} µm")
-        7.6 µm, true 7.5 µm
+        7.7 µm, true 7.5 µm
     """
     if method not in RETRIEVALS:
         raise InputError(f"method must be one of {', '.join(RETRIEVALS)}, but it is {method!r}.")

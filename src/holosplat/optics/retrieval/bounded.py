@@ -77,16 +77,16 @@ def bounded_estimate(
     Wiener's inverse `W` of the contrast transfer function, in alternation with the bound (Papoulis 1975 and
     Gerchberg 1974, who extend spectra so): `φ ← φ₀ + (1 - W H) [φ]`, where `[φ]` is φ where it exceeds
     `SIGNIFICANT` deviations of its noise and zero elsewhere, for noise with its negative half cut off would pass for
-    matter (a support found anew in every round: the "shrinkwrap" of Marchesini et al. 2003). Of that, `W` weighs what
-    the frames say by the power expected of the phase, and then, in as many rounds more, by that of what [φ] lacks:
-    bounds know low frequencies that noise hides better than the frames do. They know nothing of matter that the frame's
+    matter (a support found anew in every round: the "shrinkwrap" of Marchesini et al. 2003). Of that, `W` weighs the
+    frames by the power expected of the phase, and then, in as many rounds more, by that of what [φ] lacks: bounds
+    determine low frequencies that noise hides better than the frames do. They do not determine matter that the frame's
     edges cut: where it may be, by the share of the strongest phase that is at the edges, the power of all is added.
 
     Frames of one pose at several distances (`SharedPoses`) have one estimate, by all of them.
     missing: pixels [V, H, W] bool without a value (`completed`). two_sided: whether phases may be negative.
     leaves: whether matter goes on above and below the frame, and at its sides. Air there would take a soft body away
     far into the frame, for only the bends of its shadow are seen; it may then go on, and ends as smoothly as it can.
-    None: nobody knows.
+    None: it is not known whether it does.
     prior: expected power (default: the one that the frames show, or `FIXED` where matter leaves them). lacking: whether
     frames show what a result lacks, such as frames over those of known bodies, so that their power is the one of that.
     """

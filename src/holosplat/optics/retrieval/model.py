@@ -61,7 +61,7 @@ class Regularised(WaveOptions):
     weight: Weight = 1.0
     """Weight of the regularisation; 1 is the Bayesian weight under the method's assumptions on the matter."""
     leaves: Leaves | None = None
-    """Whether matter goes on above and below the frames, and at their sides (default: nobody knows it)."""
+    """Whether matter goes on above and below the frames, and at their sides (default: that is not known)."""
     prior: Prior | None = None
     """Expected power of the phase (default: the one that the frames show)."""
     lacking: bool = False
