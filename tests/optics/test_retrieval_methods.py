@@ -385,3 +385,13 @@ def test_bounds_tell_nothing_of_matter_that_edges_cut():
         for told in ({"lacking": True}, {}, {"leaves": (False, False)})
     )
     assert unknown < 1.02 * once < within
+
+
+def test_the_penalty_expects_what_the_estimate_lacks():
+    """Twice the power is half the penalty; it is that of the frequencies of a disc, π/4 of all."""
+    waves = model_of()
+    waves.lacks = torch.zeros(len(waves.phase), dtype=DOUBLE)
+    alone = penalty_weights(waves, 1e-3)
+    (h, w), pixels_of_raster = waves.exposures.views.shape, math.prod(waves.raster.shape) / waves.oversample**2
+    waves.lacks = waves.phase.square().mean(dim=(1, 2)) * pixels_of_raster / (h * w) * 4 / math.pi
+    assert torch.allclose(penalty_weights(waves, 1e-3), 0.5 * alone, rtol=0.1)
