@@ -170,6 +170,12 @@ HOLO_EXPORT int64_t holosplat_surface_poses(const HoloSurface*, const HoloRaster
                                             const double* image_gradient, double* rotations, double* shifts,
                                             int64_t threads);
 
+// Depths of closed meshes, image [C, H, W] <- mean over rays x rays rays of each pixel of the sum over hits of z value,
+// positive where the ray leaves, divided by 1 - bent z; points are (column, row, z) on the lattice of the rays, in one
+// view; values [C, F].
+HOLO_EXPORT int64_t holosplat_mesh_depths(const HoloSurface*, const HoloRaster*, const double* values, int64_t rays,
+                                          double bent, double* image, int64_t threads);
+
 // Wave optics, between the Fourier transforms that the caller does. Complex arrays are float pairs (re, im).
 // wave [V, H, W] <- exp(-loss - i phase) - 1 with phase = sum over channels of refraction[v][c][0] lines[v][c], and loss
 // of refraction[v][c][1]; refraction [V, C, 2], lines [V, C, H, W]

@@ -3,7 +3,7 @@
 
 #include "abi.hpp"
 
-int64_t holosplat_abi() { return 10; }
+int64_t holosplat_abi() { return 11; }
 
 int64_t holosplat_best_isa() {
 #if defined(__x86_64__) || defined(_M_X64)

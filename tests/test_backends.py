@@ -135,8 +135,8 @@ def test_the_command_line_lists_and_refuses(monkeypatch, capsys, tmp_path):
 
 
 def test_a_backend_that_an_operation_lacks_is_missing():
-    with pytest.raises(MissingError, match=r"mesh cannot use backend 'cpu'"):
-        backends.implementation("holosplat.projectors.mesh", "cpu")
+    with pytest.raises(MissingError, match=r"optics cannot use backend 'cpu'"):
+        backends.implementation("holosplat.optics", "cpu")
 
 
 @pytest.fixture

@@ -35,6 +35,7 @@ SUPPORT: dict[str, tuple[str, str, dict[str, str]]] = {
     "line integrals of Gaussians": ("projectors.splat", "splat", {}),
     "Gaussians on voxels": ("projectors.splat", "voxelise", {}),
     "line integrals of closed surfaces": ("projectors.surface", "thickness", {}),
+    "line integrals of specimens' meshes": ("projectors.mesh", "mean_depths", {"cuda": "plain torch"}),
     "line integrals of voxels": ("projectors.voxels.lattice_kernels", "Kernels", {}),
     "line integrals of voxels about one axis": ("projectors.voxels.slice_products", "Products", {}),
     "wave optics": ("optics.hologram", "hologram", {"cpu": "C++, MKL's or scipy's FFT", "cuda": "Triton, torch's FFT"}),

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from .checks import MissingError
 
-ABI = 10
+ABI = 11
 ISAS = ("sse2", "avx2", "avx512")
 """Builds for x86-64, slowest first. Other processors have one build, `generic`."""
 
@@ -171,6 +171,7 @@ _FUNCTIONS = {
     "holosplat_surface": (POINTER(Surface), POINTER(Raster), c_int64, c_void_p, c_int64),
     "holosplat_surface_shares": (POINTER(Surface), POINTER(Raster), *(c_void_p,) * 3, c_int64),
     "holosplat_surface_poses": (POINTER(Surface), POINTER(Raster), *(c_void_p,) * 4, c_int64),
+    "holosplat_mesh_depths": (POINTER(Surface), POINTER(Raster), c_void_p, c_int64, c_double, c_void_p, c_int64),
     "holosplat_exit_wave": (POINTER(Raster), *(c_void_p,) * 3, c_int64),
     "holosplat_exit_wave_backward": (POINTER(Raster), *(c_void_p,) * 4, c_int64),
     "holosplat_transfer": (POINTER(Raster), *(c_void_p,) * 2, c_double, c_int64, c_void_p, c_int64),

@@ -16,7 +16,7 @@ from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
 from holosplat.mesh import TriangleMesh
 from holosplat.projectors.mesh import mesh_line_integrals, voxelise_meshes
-from holosplat.projectors.mesh import rays as mesh_rays
+from holosplat.projectors.mesh import reference
 from holosplat.projectors.voxels import SliceProjector, voxel_line_integrals
 
 SHAPE = (33, 46)
@@ -300,10 +300,39 @@ def test_batches_change_nothing(monkeypatch, rays):
         for radius, at in ((3.5, (4.0, -3.0, 2.0)), (4.0, (21.0, 2.0, -5.0)))
     ))  # fmt: skip
     values = np.random.default_rng(0).normal(size=(2, len(faces)))
-    whole = mesh_line_integrals(vertices, faces, values, poses(3), rays)
-    monkeypatch.setattr(mesh_rays, "MAX_HITS", {"cpu": 100})
-    parts = mesh_line_integrals(vertices, faces, values, poses(3), rays)
+    whole = mesh_line_integrals(vertices, faces, values, poses(3), rays, "reference")
+    monkeypatch.setattr(reference, "MAX_HITS", {"cpu": 100})
+    parts = mesh_line_integrals(vertices, faces, values, poses(3), rays, "reference")
     assert torch.allclose(parts, whole, rtol=0, atol=1e-12 * float(whole.abs().max()))
+
+
+@pytest.mark.parametrize("shape", [(33, 46), (1, 7), (40, 9)])
+@pytest.mark.parametrize("source", [None, 90.0])
+@pytest.mark.parametrize("rays", [1, 2, 3])
+def test_the_kernel_is_its_twin(shape, source, rays):
+    """Meshes with a cavity that overlap and that the field cuts, in parallel beams and in cones; for every number of
+    threads to the last bit, though each has its own rows."""
+    hole = icosphere(2, 3.0)
+    vertices, faces = joined(
+        icosphere(3, 9.0),
+        replace(hole, faces=hole.faces[:, ::-1]),
+        icosphere(2, 4.0).transformed(np.eye(3), np.array([21.0, 2.0, -5.0])),
+        box((-8.0, -30, -3), (-2.0, 30, 3), 4),
+    )
+    values = np.random.default_rng(0).normal(size=(2, len(faces)))
+    views = poses(3, shape)
+    views = views if source is None else replace(views, sources=np.full(3, source))
+    wanted = mesh_line_integrals(vertices, faces, values, views, rays, "reference")
+    threads, found = torch.get_num_threads(), []
+    try:
+        for count in (1, 2, 5):
+            torch.set_num_threads(count)
+            found.append(mesh_line_integrals(vertices, faces, values, views, rays, "cpu"))
+    finally:
+        torch.set_num_threads(threads)
+    assert float(wanted.abs().max()) > 5
+    assert torch.allclose(found[0], wanted, rtol=0, atol=1e-12 * float(wanted.abs().max()))
+    assert all(torch.equal(one, found[0]) for one in found[1:])
 
 
 def test_an_empty_field_is_no_trouble():
@@ -334,6 +363,13 @@ def test_voxels_approach_the_mesh():
 
 
 # --- bad input ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("corner", [-1, 8])
+def test_faces_name_vertices_that_are_there(corner):
+    faces = np.full((12, 3), corner)
+    with pytest.raises(InputError, match=f"faces must name vertices 0 to 7, but one names {corner}"):
+        mesh_line_integrals(np.zeros((8, 3)), faces, np.zeros((1, 12)), poses(1))
 
 
 @pytest.mark.parametrize(

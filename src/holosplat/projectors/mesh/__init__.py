@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...backends import device
+from ...backends import device, implementation
 from ...checks import require, shaped
 from ...geometry import Grid, Views
 from .. import obliquity
-from .rays import mean_depths, occupancy
+from .reference import occupancy
 
 __all__ = ["mesh_line_integrals", "voxelise_meshes"]
 
@@ -27,10 +27,10 @@ def mesh_line_integrals(
     inside the closed surface that each face belongs to. A pixel is the mean over `rays × rays` rays through it.
     Overlapping bodies add up. Along a ray the depth inside a closed surface is `Σ sign(n·z) z_hit` over the faces it
     crosses. In cones points go to `(x, y, z) / (1 + z / R)`, which keeps planes planes and makes rays parallel, and
-    depths come back at the hits. backend: resolved; on its device plain torch computes.
+    depths come back at the hits. backend: resolved.
     """
     _check(vertices, faces, face_values, rays)
-    where = device(backend)
+    where, compute = device(backend), implementation(__name__, backend)
     corners, values = _on(where, faces, face_values)
     out = values.new_empty(len(views), len(values), *views.shape)
     for v, pixel in enumerate(views.pixel_sizes.tolist()):
@@ -38,7 +38,7 @@ def mesh_line_integrals(
         lab = vertices @ views.rotations[v].T
         lab /= 1 + bent * lab[:, 2:]
         lab[:, :2] -= views.shifts[v]
-        out[v] = mean_depths(torch.from_numpy(lab).to(where), corners, values, views.shape, pixel, rays, bent)
+        out[v] = compute.mean_depths(torch.from_numpy(lab).to(where), corners, values, views.shape, pixel, rays, bent)
         if bent:
             out[v] *= _obliquity(views, v).to(where)
     return out
@@ -69,4 +69,10 @@ def _check(vertices: np.ndarray, faces: np.ndarray, face_values: np.ndarray, ray
     shaped("vertices", vertices, (None, 3))
     shaped("faces", faces, (None, 3))
     shaped("face_values", face_values, (None, len(faces)))
+    ends = (int(faces.min()), int(faces.max())) if len(faces) else (0, -1)
+    wrong = ends[0] if ends[0] < 0 else ends[1]
+    require(
+        ends[0] >= 0 and ends[1] < len(vertices),
+        f"faces must name vertices 0 to {len(vertices) - 1}, but one names {wrong}; correct the mesh.",
+    )
     require(rays >= 1, f"rays must be at least 1, but it is {rays}.")

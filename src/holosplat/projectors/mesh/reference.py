@@ -30,10 +30,8 @@ def mean_depths(
     source's distance [1/m]; float64 and int64, on one device.
     """
     (h, w), fine = shape, (shape[0] * rays, shape[1] * rays)
-    u = rays * lab[:, 0] / pitch + 0.5 * (fine[1] - 1) + NUDGE[0]
-    v = rays * lab[:, 1] / pitch + 0.5 * (fine[0] - 1) + NUDGE[1]
     out = values.new_zeros(len(values), h * w)
-    for ray, z, sign, face in ray_hits(torch.stack([u, v, lab[:, 2]], 1), faces, fine):
+    for ray, z, sign, face in ray_hits(on_lattice(lab, shape, pitch, rays), faces, fine):
         row, column = ray // fine[1], ray % fine[1]
         pixel = row // rays * w + column // rays  # at once: the raster of all rays would not fit the caches
         depth = sign * z / (1 - bent * z)
@@ -41,6 +39,16 @@ def mean_depths(
         for total, value in zip(out, values):
             total[first : last + 1] += torch.bincount(pixel - first, depth * value[face], last + 1 - first)
     return (out / rays**2).reshape(-1, h, w)
+
+
+def on_lattice(lab: Tensor, shape: tuple[int, int], pitch: float, rays: int) -> Tensor:
+    """Vertices [P, 3] m as (column, row) on the lattice of the rays and depth [m]; arguments as those of
+    `mean_depths`."""
+    u, v = (
+        rays * lab[:, axis] / pitch + 0.5 * (rays * count - 1) + nudge
+        for axis, count, nudge in zip((0, 1), shape[::-1], NUDGE)
+    )
+    return torch.stack([u, v, lab[:, 2]], 1)
 
 
 def occupancy(vertices: Tensor, faces: Tensor, values: Tensor, grid: Grid, rays: int) -> Tensor:
