@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
 from holosplat.mesh import TriangleMesh
-from holosplat.projectors.mesh import mesh_line_integrals, voxelise_meshes
-from holosplat.projectors.mesh import reference
+from holosplat.projectors.mesh import mesh_line_integrals, reference, voxelise_meshes
 from holosplat.projectors.voxels import SliceProjector, voxel_line_integrals
 
 SHAPE = (33, 46)
