@@ -5,8 +5,8 @@
 
 Generated red cells of 8 µm (1280 triangles each), 20 keV, 10 cm, PSF 0.5 px, seed 1; each case is a process of its own.
 Accuracy: the same cells on a field of 96 × 80 pixels, against float64 waves and rays on a raster `FINER` times as fine
-as a pixel, root mean square over the contrast's. Projection: 12 views of the cells by the compiled kernel and by its twin
-in plain torch, in turns, the least of three times.
+as a pixel, root mean square over the contrast's. Projection: 12 views of the cells by the compiled kernel and by
+its twin in plain torch, in turns, the least of three times.
 """
 
 from __future__ import annotations

@@ -32,6 +32,7 @@ PRINTED = {
     "versions": ("both versions one after the other, as the page says", "an hour"),
     "simulation-costs": ("python benchmarks/simulate.py", "minutes, alone on two cores"),
     "simulation-errors": ("python benchmarks/simulate.py", "minutes"),
+    "simulation-projection": ("python benchmarks/simulate.py", "minutes, alone on two cores"),
     "prototypes": ("trials before the code was written, which no script keeps", "minutes"),
     "real-data": ("python benchmarks/real_data.py --data FOLDER", "an hour"),
     "step": ("python benchmarks/step.py --json", "a minute, alone on two cores"),
