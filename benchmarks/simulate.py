@@ -102,9 +102,9 @@ def accuracy(pixel: float) -> dict[str, float]:
     return {"pixel": pixel, **{name: float(error) / contrast for name, error in errors.items()}}
 
 
-def projection(samples: int) -> dict[str, float]:
+def projection(samples: int, pixel: float) -> dict[str, float]:
     """Seconds of the kernel and of its twin, and their largest difference over the largest number."""
-    views, scene = exposures(SMALL, 12, 0.5e-6).views.refined(samples), cells(0.6 * min(SMALL) * 0.5e-6)
+    views, scene = exposures(SMALL, 12, pixel).views.refined(samples), cells(0.6 * min(SMALL) * pixel)
     seconds, found = {}, {}
     for _ in range(3):
         for backend in ("cpu", "reference"):
@@ -159,7 +159,7 @@ def main() -> None:
     for name in CASES:
         done = subprocess.run([sys.executable, __file__, "--case", name], capture_output=True, text=True, check=True)
         report["rows"].append(json.loads(done.stdout))
-    report["projection"] = [projection(samples) for samples in FINE]
+    report["projection"] = [projection(samples, 0.5e-6) for samples in FINE]
     report["accuracy"] = [accuracy(pixel) for pixel in (0.5e-6, 1e-6)]
     print(json.dumps(report, indent=2) if options.json else table(report))
 

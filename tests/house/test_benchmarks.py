@@ -208,9 +208,14 @@ def test_what_the_benchmark_of_simulation_reports(scripts, monkeypatch):
     errors = script.accuracy(1e-6)
     assert 0 < errors["single_precision"] < 1e-5
     assert 1e-4 < errors["method"] < 5e-3
-    report = {"rows": rows, "accuracy": [errors], "load": 0.5, "commit": "abc", **script.environment("reference")}
+    projected = script.projection(2, 1e-6)
+    assert projected["apart"] < 1e-12
+    assert projected["cpu"] > 0
+    report = {"rows": rows, "accuracy": [errors], "projection": [projected], "load": 0.5, "commit": "abc"}
+    report |= script.environment("reference")
     assert "| frames | 48² of 1 µm | 6 | 4 |" in script.table(report)
     assert "| voxels | 48³ of 1 µm | – | – |" in script.table(report)
+    assert "| samples a pixel | C++ / s |" in script.table(report)
 
 
 def test_options_of_fields_are_varied_one_by_one(scripts):

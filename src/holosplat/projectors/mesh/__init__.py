@@ -13,7 +13,7 @@ from ...backends import device, implementation
 from ...checks import require, shaped
 from ...geometry import Grid, Views
 from .. import obliquity
-from .reference import occupancy
+from .filling import occupancy
 
 __all__ = ["mesh_line_integrals", "voxelise_meshes"]
 
