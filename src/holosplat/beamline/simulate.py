@@ -192,9 +192,10 @@ def _tiles(wanted: torch.Tensor, h: int, w: int) -> list[tuple[int, int]]:
 def simulated_frames(obj: Object, exposures: Exposures, how: Simulation = Simulation()) -> Iterator[np.ndarray]:
     """Simulate frames [H, W] float32 of `obj`, one by one, without keeping them.
 
-    Plain torch (the `reference` of the optics, which fits use with that backend alone), on a GPU if the backend is
-    `cuda`, on a fine raster in single precision, less than 1e-5 of the contrast from double precision. A frame is the
-    average of the intensities at its pulses, with the light and the noise of `how`.
+    The optics are plain torch (their `reference`, which fits use with that backend alone), on a GPU if the backend is
+    `cuda`, on a fine raster in single precision, less than 1e-5 of the contrast from double precision; meshes are
+    projected by kernels that fits do not use. A frame is the average of the intensities at its pulses, with the light
+    and the noise of `how`.
     """
     fine, detect, backend = how.samples(exposures), how.detector(exposures), resolve(how.backend)
     obj = obj.on(backend) if isinstance(obj, (MeshScene, MeshSeries)) else obj

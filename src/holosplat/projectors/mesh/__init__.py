@@ -69,10 +69,9 @@ def _check(vertices: np.ndarray, faces: np.ndarray, face_values: np.ndarray, ray
     shaped("vertices", vertices, (None, 3))
     shaped("faces", faces, (None, 3))
     shaped("face_values", face_values, (None, len(faces)))
-    ends = (int(faces.min()), int(faces.max())) if len(faces) else (0, -1)
-    wrong = ends[0] if ends[0] < 0 else ends[1]
-    require(
-        ends[0] >= 0 and ends[1] < len(vertices),
-        f"faces must name vertices 0 to {len(vertices) - 1}, but one names {wrong}; correct the mesh.",
-    )
+    for corner in (faces.min(), faces.max()) if len(faces) else ():
+        require(
+            0 <= corner < len(vertices),
+            f"faces must name vertices 0 to {len(vertices) - 1}, but one names {corner}; correct the mesh.",
+        )
     require(rays >= 1, f"rays must be at least 1, but it is {rays}.")
